@@ -1,0 +1,38 @@
+"""tapip3d_lite: TAPIP3D ("Tracking Any Point in Persistent 3D Geometry") small enough to read, exact where it matters.
+
+Names are loaded on first use, so that `import tapip3d_lite` is instant and a clip can be read without torch models,
+MuJoCo or plotly being imported.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "clip": ["Clip", "Tracks", "grid_queries", "load_clip", "load_tracks", "queries_from_pixels"],
+    "check": ["check_clip"],
+    "simulate": ["SimulationConfig", "simulate_clip"],
+    "evaluation.metrics": ["tapvid2d_metrics", "tapvid3d_metrics"],
+    "evaluation.evaluate": ["evaluate"],
+    "trackers": ["list_trackers", "load_tracker"],
+    "model.tracker": ["Tracker", "TrackerConfig"],
+    "model.weights": ["from_official_state", "load_official"],
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+_MODULES = {"geometry": "geometry", "figures": "ui.figures", "exercises": "ui.exercises", "widgets": "ui.widgets"}
+
+__all__ = [*_HOME_OF, *_MODULES]
+
+
+def __getattr__(name: str) -> object:
+    if name in _MODULES:
+        return import_module(f"{__name__}.{_MODULES[name]}")
+    if name in _HOME_OF:
+        return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

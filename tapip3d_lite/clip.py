@@ -1,0 +1,421 @@
+"""`Clip` and `Tracks`: what every function of the kit takes and returns, and how they lie on disk.
+
+A clip on disk is the authors' input npz (`video`, `depths`, `intrinsics`, `extrinsics`, `query_point`) plus, where
+the truth is known, `tracks`, `visible` and `dynamic`. Tracks on disk are the authors' result npz (`coords`, `visibs`,
+`query_points`). So every clip of ours feeds their code and every clip of theirs feeds ours.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from tapip3d_lite.files import atomic_path
+from tapip3d_lite.geometry import point_map, project, unproject
+
+_CLIP_KEYS = ("video", "depths", "intrinsics", "extrinsics")
+_OWN_KEYS = (*_CLIP_KEYS, "query_point", "tracks", "visible", "dynamic", "name", "fps")
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """3D trajectories of N points over T frames.
+
+    Attributes:
+        xyz: (T, N, 3) float32, world frame, scene units.
+        visible: (T, N) bool.
+        queries: (N, 4) float32, rows (t, x, y, z): frame index and world position.
+        visible_logits: (T, N) float32 before the sigmoid, or None where nothing was estimated.
+        dynamic: (N,) bool, True for points on bodies that move in the world, or None where unknown.
+
+    Raises:
+        ValueError: shapes, dtypes or values that do not fit together.
+    """
+
+    xyz: np.ndarray
+    visible: np.ndarray
+    queries: np.ndarray
+    visible_logits: np.ndarray | None = None
+    dynamic: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        _set(self, "xyz", _floats("Tracks.xyz", self.xyz, (None, None, 3)))
+        frames, count = self.xyz.shape[:2]
+        _set(self, "visible", _bools("Tracks.visible", self.visible, (frames, count)))
+        _set(self, "queries", _floats("Tracks.queries", self.queries, (count, 4), finite=True))
+        if self.visible_logits is not None:
+            logits = _floats("Tracks.visible_logits", self.visible_logits, (frames, count))
+            _set(self, "visible_logits", logits)
+        if self.dynamic is not None:
+            _set(self, "dynamic", _bools("Tracks.dynamic", self.dynamic, (count,)))
+
+    def select(self, which: np.ndarray | slice) -> Tracks:
+        """The tracks that an index, a slice or a boolean mask over N picks."""
+        logits, dynamic = self.visible_logits, self.dynamic
+        return Tracks(
+            self.xyz[:, which],
+            self.visible[:, which],
+            self.queries[which],
+            None if logits is None else logits[:, which],
+            None if dynamic is None else dynamic[which],
+        )
+
+    def save(self, path: str | Path, clip: Clip | None = None) -> None:
+        """Write the authors' result npz atomically; with the clip, everything that their viewer needs."""
+        arrays = {"coords": self.xyz, "visibs": self.visible, "query_points": self.queries}
+        if self.visible_logits is not None:
+            arrays["visib_logits"] = self.visible_logits
+        if self.dynamic is not None:
+            arrays["dynamic"] = self.dynamic
+        if clip is not None:
+            arrays["video"] = np.moveaxis(clip.video, -1, 1).astype(np.float32) / 255
+            arrays |= {key: getattr(clip, key) for key in _CLIP_KEYS[1:]}
+        _save_npz(path, arrays)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One posed RGB-D video, with ground-truth tracks where they are known.
+
+    Attributes:
+        video: (T, H, W, 3) uint8, RGB.
+        depths: (T, H, W) float32 z-depth in scene units; 0 marks an invalid pixel (non-finite input becomes 0).
+        intrinsics: (T, 3, 3) float32, pixels; the top-left pixel's centre is (0, 0).
+        extrinsics: (T, 4, 4) float32, world to camera, OpenCV axes.
+        queries: (N, 4) float32 rows (t, x, y, z) in the world frame, or None.
+        tracks: the true `Tracks`, or None.
+        name: for titles and tables.
+        fps: frames per second.
+        extras: arrays under unknown keys, kept for the round trip to disk.
+
+    Raises:
+        ValueError: names the argument, what was expected, what came, and what to do.
+    """
+
+    video: np.ndarray
+    depths: np.ndarray
+    intrinsics: np.ndarray
+    extrinsics: np.ndarray
+    queries: np.ndarray | None = None
+    tracks: Tracks | None = None
+    name: str = "clip"
+    fps: float = 12.0
+    extras: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _set(self, "video", _checked_video(self.video))
+        frames, height, width = self.video.shape[:3]
+        depths = _floats("Clip.depths", self.depths, (frames, height, width), like="video (T, H, W, 3)")
+        depths = np.where(np.isfinite(depths) & (depths > 0), depths, np.float32(0))
+        if not depths.any():
+            raise ValueError(
+                "Clip.depths: no valid pixel in the whole clip (all 0, negative or non-finite); check the file's unit and key"
+            )
+        _set(self, "depths", depths)
+        for key, side in (("intrinsics", 3), ("extrinsics", 4)):
+            value = _floats(
+                f"Clip.{key}", getattr(self, key), (frames, side, side), finite=True, like="video (T, H, W, 3)"
+            )
+            _set(self, key, value)
+        _check_cameras(self.intrinsics, self.extrinsics)
+        if self.queries is None and self.tracks is not None:
+            _set(self, "queries", self.tracks.queries)
+        if self.queries is not None:
+            _set(self, "queries", check_queries(self, self.queries))
+        if self.tracks is not None and len(self.tracks.xyz) != frames:
+            raise ValueError(
+                f"Clip.tracks: expected {frames} frames as in the video, got {len(self.tracks.xyz)}; cut both alike"
+            )
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            raise ValueError(f"Clip.fps: expected a positive number, got {self.fps}")
+
+    def __len__(self) -> int:
+        return len(self.video)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) in pixels."""
+        return self.video.shape[1], self.video.shape[2]
+
+    def points(self, space: str = "world") -> np.ndarray:
+        """Point maps (T, H, W, 3) in `"world"` or `"camera"` coordinates; invalid pixels are NaN."""
+        if space not in ("world", "camera"):
+            raise ValueError(f'Clip.points: space must be "world" or "camera", got {space!r}')
+        points = point_map(self.depths, self.intrinsics, self.extrinsics if space == "world" else None)
+        return np.where(self.depths[..., None] > 0, points, np.float32(np.nan))
+
+    def cut(self, start: int, stop: int) -> Clip:
+        """Frames [start, stop), with the tracks and queries whose query frame lies inside."""
+        if not 0 <= start < stop <= len(self):
+            raise ValueError(f"Clip.cut: expected 0 <= start < stop <= {len(self)}, got [{start}, {stop})")
+        queries, tracks = self.queries, self.tracks
+        if tracks is not None:
+            inside = (tracks.queries[:, 0] >= start) & (tracks.queries[:, 0] < stop)
+            kept = tracks.select(inside)
+            logits = kept.visible_logits
+            tracks = Tracks(
+                kept.xyz[start:stop],
+                kept.visible[start:stop],
+                _shift(kept.queries, start),
+                None if logits is None else logits[start:stop],
+                kept.dynamic,
+            )
+        if queries is not None:
+            queries = _shift(queries[(queries[:, 0] >= start) & (queries[:, 0] < stop)], start)
+        # Only what is known to be per frame is cut along: an unknown array may be anything.
+        extras = {k: v[start:stop] if k.endswith("_right") else v for k, v in self.extras.items()}
+        frames = {key: getattr(self, key)[start:stop] for key in _CLIP_KEYS}
+        return replace(self, **frames, queries=queries, tracks=tracks, extras=extras)
+
+    def save(self, path: str | Path) -> None:
+        """Write the clip as a compressed npz: to a temporary file first, then renamed, so never half written."""
+        arrays = dict(self.extras) | {key: getattr(self, key) for key in _CLIP_KEYS}
+        if self.queries is not None:
+            arrays["query_point"] = self.queries
+        if self.tracks is not None:
+            if not np.array_equal(self.tracks.queries, self.queries):
+                raise ValueError(
+                    "Clip.save: tracks.queries differ from clip.queries; one file holds one set of queries"
+                )
+            arrays |= {"tracks": self.tracks.xyz, "visible": self.tracks.visible}
+            if self.tracks.dynamic is not None:
+                arrays["dynamic"] = self.tracks.dynamic
+        arrays |= {"name": np.array(self.name), "fps": np.array(self.fps)}
+        _save_npz(path, arrays)
+
+
+def load_clip(path: str | Path) -> Clip:
+    """Read a clip from the authors' input npz or from one of ours.
+
+    A single (3, 3) or (4, 4) camera is taken for all frames.
+
+    Raises:
+        ValueError: the file is missing, truncated, not an npz, needs pickle, or its arrays do not fit together.
+    """
+    arrays = _load_npz(path)
+    missing = [key for key in _CLIP_KEYS if key not in arrays]
+    if missing:
+        raise ValueError(
+            f"{path}: a clip needs the keys {', '.join(_CLIP_KEYS)}; {', '.join(missing)} missing, "
+            f"the file has {', '.join(sorted(arrays)) or 'none'}; for RGB-only video estimate depth and pose first (e.g. with MegaSaM)"
+        )
+    frames = len(arrays["video"]) if arrays["video"].ndim else 0
+    for key in ("intrinsics", "extrinsics"):
+        if arrays[key].ndim == 2:
+            arrays[key] = np.repeat(arrays[key][None], frames, axis=0)
+    tracks = _stored_tracks(path, arrays)
+    return Clip(
+        **{key: arrays[key] for key in _CLIP_KEYS},
+        queries=arrays.get("query_point"),
+        tracks=tracks,
+        name=str(arrays["name"]) if "name" in arrays else Path(path).stem,
+        fps=float(arrays["fps"]) if "fps" in arrays else 12.0,
+        extras={key: value for key, value in arrays.items() if key not in _OWN_KEYS},
+    )
+
+
+def load_tracks(path: str | Path) -> Tracks:
+    """Read tracks from a result npz (`Tracks.save`, or the authors' result file).
+
+    Raises:
+        ValueError: as for `load_clip`.
+    """
+    arrays = _load_npz(path)
+    missing = [key for key in ("coords", "visibs", "query_points") if key not in arrays]
+    if missing:
+        raise ValueError(f"{path}: a result needs coords, visibs, query_points; {', '.join(missing)} missing")
+    optional = arrays.get("visib_logits"), arrays.get("dynamic")
+    return Tracks(arrays["coords"], arrays["visibs"], arrays["query_points"], *optional)
+
+
+def check_queries(clip: Clip, queries: np.ndarray) -> np.ndarray:
+    """Check world-space queries against a clip and return them as float32.
+
+    Args:
+        queries: (N, 4) rows (t, x, y, z).
+
+    Raises:
+        ValueError: wrong shape, t not a frame of the clip, or a point outside that frame's view.
+    """
+    queries = _floats("queries", queries, (None, 4), finite=True)
+    t = _frames_of(clip, queries)
+    camera = clip.intrinsics[t], clip.extrinsics[t]
+    uv, z = project(queries[:, None, 1:], *camera)
+    height, width = clip.size
+    uv, z = uv[:, 0], z[:, 0]
+    # Half a pixel is the image's border; the rest is slack for float32 and for points on a border pixel.
+    outside = (z <= 0) | (np.abs(uv * 2 - (width - 1, height - 1)) > (width + 2, height + 2)).any(-1)
+    if outside.any():
+        first = int(np.flatnonzero(outside)[0])
+        raise ValueError(
+            f"queries: {int(outside.sum())} of {len(queries)} lie outside the view of their frame; row {first} = {queries[first].tolist()} "
+            f"projects to (u, v) = {np.round(uv[first], 1).tolist()}, z = {z[first]:.3g} in a {width}x{height} image; "
+            "give (t, x, y, z) in world coordinates, or use queries_from_pixels for pixels"
+        )
+    return queries
+
+
+def queries_from_pixels(clip: Clip, pixels: np.ndarray) -> np.ndarray:
+    """Lift pixel queries (t, u, v) to world-space queries by the depth at the nearest pixel.
+
+    Args:
+        pixels: (N, 3) rows (t, u, v); (0, 0) is the top-left pixel's centre.
+
+    Returns:
+        (N, 4) float32 rows (t, x, y, z).
+
+    Raises:
+        ValueError: wrong shape, frame or pixel outside the clip, or invalid depth there.
+    """
+    pixels = _floats("pixels", pixels, (None, 3), finite=True)
+    t = _frames_of(clip, pixels)
+    nearest = np.rint(pixels[:, 1:]).astype(int)
+    height, width = clip.size
+    outside = ((nearest < 0) | (nearest >= (width, height))).any(-1)
+    if outside.any():
+        first = pixels[outside][0].tolist()
+        raise ValueError(
+            f"pixels: {first} is outside the {width}x{height} image; u must be in [0, {width - 1}], v in [0, {height - 1}]"
+        )
+    depth = clip.depths[t, nearest[:, 1], nearest[:, 0]]
+    if not depth.all():
+        first = pixels[depth == 0][0].tolist()
+        raise ValueError(
+            f"pixels: {int((depth == 0).sum())} queries fall on invalid depth, first {first}; move them or fill the depth"
+        )
+    world = unproject(pixels[:, None, 1:], depth[:, None], clip.intrinsics[t], clip.extrinsics[t])
+    return np.concatenate([pixels[:, :1], world[:, 0]], -1)
+
+
+def grid_queries(clip: Clip, side: int = 16, frame: int = 0, margin: float = 1 / 64) -> np.ndarray:
+    """A side x side grid of queries on one frame, without the nodes that fall on invalid depth.
+
+    The outermost nodes keep `margin` times the image width from every border (SEMANTICS: the released support grid).
+
+    Returns:
+        (at most side^2, 4) float32 rows (t, x, y, z), row-major.
+    """
+    if side < 1 or not 0 <= frame < len(clip):
+        raise ValueError(
+            f"grid_queries: expected side >= 1 and a frame in [0, {len(clip) - 1}], got side={side}, frame={frame}"
+        )
+    height, width = clip.size
+    inset = width * margin
+    u, v = np.meshgrid(np.linspace(inset, width - inset, side), np.linspace(inset, height - inset, side))
+    pixels = np.stack([np.full(u.size, frame), u.ravel(), v.ravel()], -1)
+    pixels[:, 1:] = np.minimum(pixels[:, 1:], (width - 1, height - 1))
+    nearest = np.rint(pixels[:, 1:]).astype(int)
+    return queries_from_pixels(clip, pixels[clip.depths[frame, nearest[:, 1], nearest[:, 0]] > 0])
+
+
+def resolve_queries(clip: Clip, queries: np.ndarray | None, grid: int = 16) -> np.ndarray:
+    """The queries a tracker should follow: those given, else the clip's own, else a grid on the first frame."""
+    if queries is not None:
+        return check_queries(clip, queries)
+    return grid_queries(clip, grid) if clip.queries is None else clip.queries
+
+
+def _stored_tracks(path: str | Path, arrays: dict[str, np.ndarray]) -> Tracks | None:
+    if "tracks" not in arrays:
+        return None
+    missing = [key for key in ("visible", "query_point") if key not in arrays]
+    if missing:
+        raise ValueError(f"{path}: tracks need {' and '.join(missing)} beside them; add the key or drop tracks")
+    return Tracks(arrays["tracks"], arrays["visible"], arrays["query_point"], None, arrays.get("dynamic"))
+
+
+def _checked_video(video: np.ndarray) -> np.ndarray:
+    video = np.asarray(video)
+    if video.ndim != 4 or video.shape[-1] != 3 or video.dtype != np.uint8:
+        raise ValueError(
+            f"Clip.video: expected (T, H, W, 3) uint8 RGB, got {video.shape} {video.dtype}; move the colour axis last, drop alpha, scale [0, 1] floats by 255"
+        )
+    if 0 in video.shape:
+        raise ValueError(f"Clip.video: zero frames or pixels in {video.shape}; give at least one frame")
+    return video
+
+
+def _check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
+    focal = intrinsics[:, [0, 1], [0, 1]]
+    if not (focal > 0).all():
+        raise ValueError(f"Clip.intrinsics: fx and fy must be positive, got {focal[(focal <= 0).any(-1)][0].tolist()}")
+    rotation = extrinsics[:, :3, :3]
+    error = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
+    mirrored = np.linalg.det(rotation) < 0
+    if (error > 1e-2).any() or mirrored.any() or np.abs(extrinsics[:, 3] - (0, 0, 0, 1)).max() > 1e-4:
+        frame = int(np.argmax(error + 10 * mirrored))
+        raise ValueError(
+            f"Clip.extrinsics: frame {frame} is not a rigid world-to-camera motion (R R^T differs from I by {error[frame]:.2g}, "
+            f"det R = {np.linalg.det(rotation[frame]):.2g}, last row {extrinsics[frame, 3].tolist()}); remove scale, use row-major [R|t; 0 0 0 1]"
+        )
+
+
+def _frames_of(clip: Clip, rows: np.ndarray) -> np.ndarray:
+    t = rows[:, 0]
+    wrong = (t < 0) | (t >= len(clip)) | (t != np.rint(t))
+    if wrong.any():
+        raise ValueError(
+            f"queries: t must be a whole frame index in [0, {len(clip) - 1}], got {t[wrong][0]:g}; the order is (t, ...)"
+        )
+    return t.astype(int)
+
+
+def _shift(queries: np.ndarray, start: int) -> np.ndarray:
+    return queries - np.array([start, 0, 0, 0], np.float32)
+
+
+def _set(instance: object, name: str, value: object) -> None:
+    object.__setattr__(instance, name, value)  # the dataclass is frozen; this normalises once, on construction
+
+
+def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(expected) and all(e is None or s == e for s, e in zip(shape, expected, strict=True))
+
+
+def _floats(
+    name: str, value: object, shape: tuple[int | None, ...], finite: bool = False, like: str = ""
+) -> np.ndarray:
+    array = np.asarray(value)
+    wanted = "(" + ", ".join("N" if s is None else str(s) for s in shape) + ")" + (f" to match {like}" if like else "")
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: expected numbers of shape {wanted}, got dtype {array.dtype}; convert to float32")
+    if not _fits(array.shape, shape):
+        raise ValueError(f"{name}: expected shape {wanted}, got {array.shape}; reorder or resize the axes")
+    array = array.astype(np.float32, copy=False)
+    if finite and not np.isfinite(array).all():
+        raise ValueError(
+            f"{name}: expected finite numbers, got {int((~np.isfinite(array)).sum())} NaN or infinite; repair or drop those frames or rows"
+        )
+    return array
+
+
+def _bools(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(value)
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}; reorder or cut the axes")
+    if array.dtype != bool and not (array.dtype.kind in "iuf" and np.isin(array, (0, 1)).all()):
+        raise ValueError(f"{name}: expected booleans, got dtype {array.dtype}; threshold it first")
+    return array.astype(bool, copy=False)
+
+
+def _load_npz(path: str | Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            if not isinstance(data, np.lib.npyio.NpzFile):
+                raise ValueError("it holds one bare array (npy)")
+            return {key: data[key] for key in data.files}
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; check the path") from None
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError, NotImplementedError) as error:
+        raise ValueError(
+            f"{path}: not a readable npz ({error}); it may be truncated, pickled or of another format"
+        ) from error
+
+
+def _save_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)

@@ -1,0 +1,176 @@
+"""Cameras and rigid motions: the only place where a coordinate convention is written down.
+
+Axes follow OpenCV (x right, y down, z forward). `extrinsics` map world to camera (`cam_from_world`, 4x4). The
+centre of the top-left pixel is (0, 0), so u = fx * X / Z + cx. Depth is the camera's z, not the ray's length.
+Every function takes NumPy arrays or torch tensors, float32 or float64, with any number of leading batch dimensions
+that broadcast against each other, and returns the same kind of array as it was given.
+
+Paper: TAPIP3D section 3.2 ("lifting to 3D"): X_world = E^-1 (z K^-1 (u, v, 1)).
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+import torch
+
+Array = np.ndarray | torch.Tensor
+
+
+def transform(points: Array, pose: Array) -> Array:
+    """Apply a rigid (or affine) motion to points.
+
+    Args:
+        points: (..., N, 3).
+        pose: (..., 4, 4), acting on column vectors: x' = R x + t.
+
+    Returns:
+        (..., N, 3) in the target frame of `pose`.
+    """
+    return points @ pose[..., :3, :3].swapaxes(-1, -2) + pose[..., None, :3, 3]
+
+
+def invert(pose: Array) -> Array:
+    """Invert a rigid motion: (R, t) becomes (R^T, -R^T t).
+
+    Args:
+        pose: (..., 4, 4) with an orthonormal rotation part.
+
+    Returns:
+        (..., 4, 4).
+    """
+    xp = _library(pose)
+    rotation = pose[..., :3, :3].swapaxes(-1, -2)
+    translation = -(rotation @ pose[..., :3, 3:])
+    return xp.concatenate([xp.concatenate([rotation, translation], -1), pose[..., 3:, :]], -2)
+
+
+def unproject(uv: Array, z: Array, intrinsics: Array, extrinsics: Array | None = None) -> Array:
+    """Lift pixels with known depth to 3D: X = z K^-1 (u, v, 1), then E^-1 X if extrinsics are given.
+
+    Args:
+        uv: (..., N, 2) pixel coordinates; integers are pixel centres.
+        z: (..., N) z-depth in scene units.
+        intrinsics: (..., 3, 3), pixels. Skew is honoured.
+        extrinsics: (..., 4, 4) world to camera, or None to stay in the camera frame.
+
+    Returns:
+        (..., N, 3) in the world frame, or in the camera frame without extrinsics.
+    """
+    xp = _library(uv)
+    fx, fy = intrinsics[..., None, 0, 0], intrinsics[..., None, 1, 1]
+    cx, cy = intrinsics[..., None, 0, 2], intrinsics[..., None, 1, 2]
+    y = (uv[..., 1] - cy) / fy
+    x = (uv[..., 0] - cx - intrinsics[..., None, 0, 1] * y) / fx
+    z = z + 0 * x  # so that z broadcasts as x does
+    points = xp.stack([x * z, y * z, z], -1)
+    return points if extrinsics is None else transform(points, invert(extrinsics))
+
+
+def project(points: Array, intrinsics: Array, extrinsics: Array | None = None, min_z: float = 1e-6) -> tuple:
+    """Project 3D points to pixels: (u, v) = (K X)_xy / z.
+
+    Args:
+        points: (..., N, 3) in the world frame, or in the camera frame without extrinsics.
+        intrinsics: (..., 3, 3), pixels.
+        extrinsics: (..., 4, 4) world to camera, or None.
+        min_z: divisor for points at or behind the camera, so that the result stays finite; their z tells.
+
+    Returns:
+        uv (..., N, 2) in pixels and z (..., N), the signed z-depth in the camera frame.
+    """
+    xp = _library(points)
+    camera = points if extrinsics is None else transform(points, extrinsics)
+    z = camera[..., 2]
+    x, y = camera[..., 0], camera[..., 1]
+    safe = xp.clip(z, min_z, None)
+    u = (intrinsics[..., None, 0, 0] * x + intrinsics[..., None, 0, 1] * y) / safe + intrinsics[..., None, 0, 2]
+    v = intrinsics[..., None, 1, 1] * y / safe + intrinsics[..., None, 1, 2]
+    return xp.stack([u, v], -1), z
+
+
+def point_map(depths: Array, intrinsics: Array, extrinsics: Array | None = None) -> Array:
+    """Lift whole depth maps to organised point maps.
+
+    Args:
+        depths: (..., H, W) z-depth; 0 puts the pixel at the camera's centre, as the released model does.
+        intrinsics: (..., 3, 3).
+        extrinsics: (..., 4, 4) world to camera, or None for points in the camera frame.
+
+    Returns:
+        (..., H, W, 3).
+    """
+    height, width = depths.shape[-2:]
+    flat = depths.reshape(*depths.shape[:-2], height * width)
+    uv = pixel_grid(height, width, like=depths)
+    points = unproject(uv.reshape(height * width, 2), flat, intrinsics, extrinsics)
+    return points.reshape(*points.shape[:-2], height, width, 3)
+
+
+def pixel_grid(height: int, width: int, like: Array) -> Array:
+    """Pixel-centre coordinates (H, W, 2) as (u, v), in the library, dtype and device of `like`."""
+    if isinstance(like, torch.Tensor):
+        v = torch.arange(height, dtype=like.dtype, device=like.device)
+        u = torch.arange(width, dtype=like.dtype, device=like.device)
+        return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+    v, u = np.arange(height, dtype=like.dtype), np.arange(width, dtype=like.dtype)
+    return np.stack(np.meshgrid(u, v, indexing="xy"), -1)
+
+
+def resize_intrinsics(intrinsics: Array, old_size: tuple[int, int], new_size: tuple[int, int]) -> Array:
+    """Intrinsics of an image resized so that corner pixel centres map to corner pixel centres.
+
+    fx, skew and cx are multiplied by (W'-1)/(W-1), fy and cy by (H'-1)/(H-1), because pixel centres are integers.
+
+    Args:
+        intrinsics: (..., 3, 3).
+        old_size: (H, W) that the intrinsics belong to; both at least 2.
+        new_size: (H', W').
+
+    Returns:
+        (..., 3, 3).
+
+    Raises:
+        ValueError: a size below 2 pixels, which has no scale.
+    """
+    if min(*old_size, *new_size) < 2:
+        raise ValueError(f"resize_intrinsics: sizes must be at least 2x2 pixels, got {old_size} -> {new_size}")
+    scale_u, scale_v = (new_size[1] - 1) / (old_size[1] - 1), (new_size[0] - 1) / (old_size[0] - 1)
+    xp = _library(intrinsics)
+    rows = [intrinsics[..., 0, :] * scale_u, intrinsics[..., 1, :] * scale_v, intrinsics[..., 2, :]]
+    return xp.stack(rows, -2)
+
+
+def look_at(eye: Array, target: Array, up: Array) -> Array:
+    """Extrinsics of a camera at `eye` that looks at `target`, with the image's y axis pointing away from `up`.
+
+    Args:
+        eye, target: (..., 3) world positions.
+        up: (..., 3) world direction that should appear upwards in the image.
+
+    Returns:
+        (..., 4, 4) world to camera.
+
+    Raises:
+        ValueError: `eye` equals `target`, or `up` is parallel to the viewing direction.
+    """
+    xp = _library(eye)
+    forward = target - eye
+    right = xp.linalg.cross(forward, up + 0 * forward)
+    lengths = (forward**2).sum(-1), (right**2).sum(-1)
+    if not bool((lengths[0] > 0).all()) or not bool((lengths[1] > 1e-12 * lengths[0]).all()):
+        raise ValueError("look_at: eye and target coincide, or up is parallel to the viewing direction; move one")
+    forward = forward / lengths[0][..., None] ** 0.5
+    right = right / lengths[1][..., None] ** 0.5
+    down = xp.linalg.cross(forward, right)
+    rotation = xp.stack([right, down, forward], -2)
+    translation = -(rotation @ eye[..., None])
+    top = xp.concatenate([rotation, translation], -1)
+    bottom = xp.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1
+    return xp.concatenate([top, bottom], -2)
+
+
+def _library(array: Array) -> ModuleType:
+    return torch if isinstance(array, torch.Tensor) else np
