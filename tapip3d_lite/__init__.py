@@ -11,7 +11,8 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 _HOMES = {
-    "clip": ["Clip", "Tracks", "grid_queries", "load_clip", "load_tracks", "queries_from_pixels"],
+    "clip": ["Clip", "Tracks", "check_queries", "load_clip", "load_tracks"],
+    "queries": ["grid_queries", "queries_from_pixels", "resolve_queries"],
     "check": ["check_clip"],
     "simulate": ["SimulationConfig", "simulate_clip"],
     "evaluation.metrics": ["tapvid2d_metrics", "tapvid3d_metrics"],

@@ -7,15 +7,15 @@ the truth is known, `tracks`, `visible` and `dynamic`. Tracks on disk are the au
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from tapip3d_lite.files import atomic_path
-from tapip3d_lite.geometry import point_map, project, unproject
+from tapip3d_lite.files import load_npz, save_npz
+from tapip3d_lite.geometry import point_map, project
+from tapip3d_lite.validate import bools, check_cameras, floats, video_frames
 
 _CLIP_KEYS = ("video", "depths", "intrinsics", "extrinsics")
 _OWN_KEYS = (*_CLIP_KEYS, "query_point", "tracks", "visible", "dynamic", "name", "fps")
@@ -43,15 +43,15 @@ class Tracks:
     dynamic: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        _set(self, "xyz", _floats("Tracks.xyz", self.xyz, (None, None, 3)))
+        _set(self, "xyz", floats("Tracks.xyz", self.xyz, (None, None, 3)))
         frames, count = self.xyz.shape[:2]
-        _set(self, "visible", _bools("Tracks.visible", self.visible, (frames, count)))
-        _set(self, "queries", _floats("Tracks.queries", self.queries, (count, 4), finite=True))
+        _set(self, "visible", bools("Tracks.visible", self.visible, (frames, count)))
+        _set(self, "queries", floats("Tracks.queries", self.queries, (count, 4), finite=True))
         if self.visible_logits is not None:
-            logits = _floats("Tracks.visible_logits", self.visible_logits, (frames, count))
+            logits = floats("Tracks.visible_logits", self.visible_logits, (frames, count))
             _set(self, "visible_logits", logits)
         if self.dynamic is not None:
-            _set(self, "dynamic", _bools("Tracks.dynamic", self.dynamic, (count,)))
+            _set(self, "dynamic", bools("Tracks.dynamic", self.dynamic, (count,)))
 
     def select(self, which: np.ndarray | slice) -> Tracks:
         """The tracks that an index, a slice or a boolean mask over N picks."""
@@ -74,7 +74,7 @@ class Tracks:
         if clip is not None:
             arrays["video"] = np.moveaxis(clip.video, -1, 1).astype(np.float32) / 255
             arrays |= {key: getattr(clip, key) for key in _CLIP_KEYS[1:]}
-        _save_npz(path, arrays)
+        save_npz(path, arrays)
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,9 @@ class Clip:
     extras: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _set(self, "video", _checked_video(self.video))
+        _set(self, "video", video_frames(self.video))
         frames, height, width = self.video.shape[:3]
-        depths = _floats("Clip.depths", self.depths, (frames, height, width), like="video (T, H, W, 3)")
+        depths = floats("Clip.depths", self.depths, (frames, height, width), like="video (T, H, W, 3)")
         depths = np.where(np.isfinite(depths) & (depths > 0), depths, np.float32(0))
         if not depths.any():
             raise ValueError(
@@ -117,11 +117,11 @@ class Clip:
             )
         _set(self, "depths", depths)
         for key, side in (("intrinsics", 3), ("extrinsics", 4)):
-            value = _floats(
+            value = floats(
                 f"Clip.{key}", getattr(self, key), (frames, side, side), finite=True, like="video (T, H, W, 3)"
             )
             _set(self, key, value)
-        _check_cameras(self.intrinsics, self.extrinsics)
+        check_cameras(self.intrinsics, self.extrinsics)
         if self.queries is None and self.tracks is not None:
             _set(self, "queries", self.tracks.queries)
         if self.queries is not None:
@@ -185,7 +185,7 @@ class Clip:
             if self.tracks.dynamic is not None:
                 arrays["dynamic"] = self.tracks.dynamic
         arrays |= {"name": np.array(self.name), "fps": np.array(self.fps)}
-        _save_npz(path, arrays)
+        save_npz(path, arrays)
 
 
 def load_clip(path: str | Path) -> Clip:
@@ -196,7 +196,7 @@ def load_clip(path: str | Path) -> Clip:
     Raises:
         ValueError: the file is missing, truncated, not an npz, needs pickle, or its arrays do not fit together.
     """
-    arrays = _load_npz(path)
+    arrays = load_npz(path)
     missing = [key for key in _CLIP_KEYS if key not in arrays]
     if missing:
         raise ValueError(
@@ -224,7 +224,7 @@ def load_tracks(path: str | Path) -> Tracks:
     Raises:
         ValueError: as for `load_clip`.
     """
-    arrays = _load_npz(path)
+    arrays = load_npz(path)
     missing = [key for key in ("coords", "visibs", "query_points") if key not in arrays]
     if missing:
         raise ValueError(f"{path}: a result needs coords, visibs, query_points; {', '.join(missing)} missing")
@@ -241,8 +241,8 @@ def check_queries(clip: Clip, queries: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: wrong shape, t not a frame of the clip, or a point outside that frame's view.
     """
-    queries = _floats("queries", queries, (None, 4), finite=True)
-    t = _frames_of(clip, queries)
+    queries = floats("queries", queries, (None, 4), finite=True)
+    t = query_frames(clip, queries)
     camera = clip.intrinsics[t], clip.extrinsics[t]
     uv, z = project(queries[:, None, 1:], *camera)
     height, width = clip.size
@@ -259,64 +259,15 @@ def check_queries(clip: Clip, queries: np.ndarray) -> np.ndarray:
     return queries
 
 
-def queries_from_pixels(clip: Clip, pixels: np.ndarray) -> np.ndarray:
-    """Lift pixel queries (t, u, v) to world-space queries by the depth at the nearest pixel.
-
-    Args:
-        pixels: (N, 3) rows (t, u, v); (0, 0) is the top-left pixel's centre.
-
-    Returns:
-        (N, 4) float32 rows (t, x, y, z).
-
-    Raises:
-        ValueError: wrong shape, frame or pixel outside the clip, or invalid depth there.
-    """
-    pixels = _floats("pixels", pixels, (None, 3), finite=True)
-    t = _frames_of(clip, pixels)
-    nearest = np.rint(pixels[:, 1:]).astype(int)
-    height, width = clip.size
-    outside = ((nearest < 0) | (nearest >= (width, height))).any(-1)
-    if outside.any():
-        first = pixels[outside][0].tolist()
+def query_frames(clip: Clip, rows: np.ndarray) -> np.ndarray:
+    """The frame indices (N,) int of rows (t, ...); ValueError where t is not a frame of the clip."""
+    t = rows[:, 0]
+    wrong = (t < 0) | (t >= len(clip)) | (t != np.rint(t))
+    if wrong.any():
         raise ValueError(
-            f"pixels: {first} is outside the {width}x{height} image; u must be in [0, {width - 1}], v in [0, {height - 1}]"
+            f"queries: t must be a whole frame index in [0, {len(clip) - 1}], got {t[wrong][0]:g}; the order is (t, ...)"
         )
-    depth = clip.depths[t, nearest[:, 1], nearest[:, 0]]
-    if not depth.all():
-        first = pixels[depth == 0][0].tolist()
-        raise ValueError(
-            f"pixels: {int((depth == 0).sum())} queries fall on invalid depth, first {first}; move them or fill the depth"
-        )
-    world = unproject(pixels[:, None, 1:], depth[:, None], clip.intrinsics[t], clip.extrinsics[t])
-    return np.concatenate([pixels[:, :1], world[:, 0]], -1)
-
-
-def grid_queries(clip: Clip, side: int = 16, frame: int = 0, margin: float = 1 / 64) -> np.ndarray:
-    """A side x side grid of queries on one frame, without the nodes that fall on invalid depth.
-
-    The outermost nodes keep `margin` times the image width from every border (SEMANTICS: the released support grid).
-
-    Returns:
-        (at most side^2, 4) float32 rows (t, x, y, z), row-major.
-    """
-    if side < 1 or not 0 <= frame < len(clip):
-        raise ValueError(
-            f"grid_queries: expected side >= 1 and a frame in [0, {len(clip) - 1}], got side={side}, frame={frame}"
-        )
-    height, width = clip.size
-    inset = width * margin
-    u, v = np.meshgrid(np.linspace(inset, width - inset, side), np.linspace(inset, height - inset, side))
-    pixels = np.stack([np.full(u.size, frame), u.ravel(), v.ravel()], -1)
-    pixels[:, 1:] = np.minimum(pixels[:, 1:], (width - 1, height - 1))
-    nearest = np.rint(pixels[:, 1:]).astype(int)
-    return queries_from_pixels(clip, pixels[clip.depths[frame, nearest[:, 1], nearest[:, 0]] > 0])
-
-
-def resolve_queries(clip: Clip, queries: np.ndarray | None, grid: int = 16) -> np.ndarray:
-    """The queries a tracker should follow: those given, else the clip's own, else a grid on the first frame."""
-    if queries is not None:
-        return check_queries(clip, queries)
-    return grid_queries(clip, grid) if clip.queries is None else clip.queries
+    return t.astype(int)
 
 
 def _stored_tracks(path: str | Path, arrays: dict[str, np.ndarray]) -> Tracks | None:
@@ -328,94 +279,9 @@ def _stored_tracks(path: str | Path, arrays: dict[str, np.ndarray]) -> Tracks | 
     return Tracks(arrays["tracks"], arrays["visible"], arrays["query_point"], None, arrays.get("dynamic"))
 
 
-def _checked_video(video: np.ndarray) -> np.ndarray:
-    video = np.asarray(video)
-    if video.ndim != 4 or video.shape[-1] != 3 or video.dtype != np.uint8:
-        raise ValueError(
-            f"Clip.video: expected (T, H, W, 3) uint8 RGB, got {video.shape} {video.dtype}; move the colour axis last, drop alpha, scale [0, 1] floats by 255"
-        )
-    if 0 in video.shape:
-        raise ValueError(f"Clip.video: zero frames or pixels in {video.shape}; give at least one frame")
-    return video
-
-
-def _check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
-    focal = intrinsics[:, [0, 1], [0, 1]]
-    if not (focal > 0).all():
-        raise ValueError(f"Clip.intrinsics: fx and fy must be positive, got {focal[(focal <= 0).any(-1)][0].tolist()}")
-    rotation = extrinsics[:, :3, :3]
-    error = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
-    mirrored = np.linalg.det(rotation) < 0
-    if (error > 1e-2).any() or mirrored.any() or np.abs(extrinsics[:, 3] - (0, 0, 0, 1)).max() > 1e-4:
-        frame = int(np.argmax(error + 10 * mirrored))
-        raise ValueError(
-            f"Clip.extrinsics: frame {frame} is not a rigid world-to-camera motion (R R^T differs from I by {error[frame]:.2g}, "
-            f"det R = {np.linalg.det(rotation[frame]):.2g}, last row {extrinsics[frame, 3].tolist()}); remove scale, use row-major [R|t; 0 0 0 1]"
-        )
-
-
-def _frames_of(clip: Clip, rows: np.ndarray) -> np.ndarray:
-    t = rows[:, 0]
-    wrong = (t < 0) | (t >= len(clip)) | (t != np.rint(t))
-    if wrong.any():
-        raise ValueError(
-            f"queries: t must be a whole frame index in [0, {len(clip) - 1}], got {t[wrong][0]:g}; the order is (t, ...)"
-        )
-    return t.astype(int)
-
-
 def _shift(queries: np.ndarray, start: int) -> np.ndarray:
     return queries - np.array([start, 0, 0, 0], np.float32)
 
 
 def _set(instance: object, name: str, value: object) -> None:
     object.__setattr__(instance, name, value)  # the dataclass is frozen; this normalises once, on construction
-
-
-def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(expected) and all(e is None or s == e for s, e in zip(shape, expected, strict=True))
-
-
-def _floats(
-    name: str, value: object, shape: tuple[int | None, ...], finite: bool = False, like: str = ""
-) -> np.ndarray:
-    array = np.asarray(value)
-    wanted = "(" + ", ".join("N" if s is None else str(s) for s in shape) + ")" + (f" to match {like}" if like else "")
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"{name}: expected numbers of shape {wanted}, got dtype {array.dtype}; convert to float32")
-    if not _fits(array.shape, shape):
-        raise ValueError(f"{name}: expected shape {wanted}, got {array.shape}; reorder or resize the axes")
-    array = array.astype(np.float32, copy=False)
-    if finite and not np.isfinite(array).all():
-        raise ValueError(
-            f"{name}: expected finite numbers, got {int((~np.isfinite(array)).sum())} NaN or infinite; repair or drop those frames or rows"
-        )
-    return array
-
-
-def _bools(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.asarray(value)
-    if array.shape != shape:
-        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}; reorder or cut the axes")
-    if array.dtype != bool and not (array.dtype.kind in "iuf" and np.isin(array, (0, 1)).all()):
-        raise ValueError(f"{name}: expected booleans, got dtype {array.dtype}; threshold it first")
-    return array.astype(bool, copy=False)
-
-
-def _load_npz(path: str | Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            if not isinstance(data, np.lib.npyio.NpzFile):
-                raise ValueError("it holds one bare array (npy)")
-            return {key: data[key] for key in data.files}
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path") from None
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError, NotImplementedError) as error:
-        raise ValueError(
-            f"{path}: not a readable npz ({error}); it may be truncated, pickled or of another format"
-        ) from error
-
-
-def _save_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)

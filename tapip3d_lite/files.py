@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 
 @contextmanager
@@ -28,3 +31,24 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def load_npz(path: str | Path) -> dict[str, np.ndarray]:
+    """All arrays of an npz file; a missing, truncated, pickled or foreign file is a ValueError."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            if not isinstance(data, np.lib.npyio.NpzFile):
+                raise ValueError("it holds one bare array (npy)")
+            return {key: data[key] for key in data.files}
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; check the path") from None
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError, NotImplementedError) as error:
+        raise ValueError(
+            f"{path}: not a readable npz ({error}); it may be truncated, pickled or of another format"
+        ) from error
+
+
+def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write a compressed npz atomically."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)
