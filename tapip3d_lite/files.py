@@ -36,9 +36,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def load_npz(path: str | Path) -> dict[str, np.ndarray]:
     """All arrays of an npz file; a missing, truncated, pickled or foreign file is a ValueError."""
     try:
-        with np.load(path, allow_pickle=False) as data:
+        # An open file of our own: np.load leaks the one it opens when the zip turns out to be broken.
+        with open(path, "rb") as file:
+            data = np.load(file, allow_pickle=False)
             if not isinstance(data, np.lib.npyio.NpzFile):
-                raise ValueError("it holds one bare array (npy)")
+                raise ValueError("it holds one bare array, not named ones")
             return {key: data[key] for key in data.files}
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; check the path") from None
