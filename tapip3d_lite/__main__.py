@@ -1,0 +1,107 @@
+"""The command line: `python -m tapip3d_lite track IN.npz --tracker klt --out OUT.npz --html OUT.html`.
+
+Bad input ends with one line on standard error and exit code 2; Ctrl-C with exit code 130.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+import tapip3d_lite as t3d
+
+
+def track(
+    clip: Positional[Path],
+    /,
+    tracker: Annotated[str, arg(help="a name of `list_trackers()` or a weights file")] = "klt",
+    out: Annotated[Path | None, arg(help="result npz in the authors' format")] = None,
+    html: Annotated[Path | None, arg(help="3D page with a time slider")] = None,
+    png: Annotated[Path | None, arg(help="picture of frames with tracks")] = None,
+    grid: Annotated[int, arg(help="queries on the first frame, side x side, where the clip has none")] = 16,
+    own_queries: Annotated[bool, arg(help="use the clip's own queries where it has some")] = True,
+    space: Annotated[str, arg(help="world or camera (learnt trackers)")] = "world",
+    device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
+) -> None:
+    """Track the points of a clip (npz) in 3D."""
+    loaded = t3d.load_clip(clip)
+    queries = loaded.queries if own_queries and loaded.queries is not None else t3d.grid_queries(loaded, grid)
+    result = t3d.load_tracker(tracker, device=device).track(loaded, queries=queries, space=space)
+    shown = result.visible.mean() if result.visible.size else 0.0
+    print(f"{clip}: {len(queries)} points over {len(loaded)} frames with {tracker}, {shown:.0%} visible")
+    if loaded.tracks is not None and own_queries:
+        scores = t3d.evaluate(result, loaded)
+        print("  ".join(f"{name} {scores[name]:.3f}" for name in ("AJ3D", "APD3D", "OA")))
+    _write(loaded, result, out, html, png)
+
+
+def _write(clip: t3d.Clip, result: t3d.Tracks, out: Path | None, html: Path | None, png: Path | None) -> None:
+    if out:
+        result.save(out, clip)
+        print(f"wrote {out}")
+    if html:
+        t3d.figures.save_html(t3d.figures.tracks_3d(clip, result), html)
+        print(f"wrote {html}")
+    if png:
+        t3d.figures.save_png(t3d.figures.overview(clip, result), png)
+        print(f"wrote {png}")
+
+
+def demo(
+    clip: Positional[Path] = Path("data_samples/arc.npz"),
+    /,
+    tracker: str = "klt",
+    out: Annotated[Path, arg(help="folder for the page and the picture")] = Path("demo_output"),
+) -> None:
+    """Track a sample clip and write a 3D page (HTML) and a picture (PNG)."""
+    track(clip, tracker=tracker, html=out / "tracks_3d.html", png=out / "tracks.png")
+    print(f"Open {(out / 'tracks_3d.html').resolve()} in a browser and move the time slider.")
+
+
+def check(clip: Positional[Path], /) -> None:
+    """Look for the usual mix-ups in a clip: camera direction, axes, intrinsics, units, ray length."""
+    findings = t3d.check_clip(t3d.load_clip(clip))
+    print("\n".join(map(str, findings)) if findings else f"{clip}: nothing suspicious found")
+
+
+def simulate(
+    out: Annotated[Path, arg(help="dataset folder; an interrupted run is continued")],
+    config: tyro.conf.OmitArgPrefixes[t3d.SimulationConfig],
+    count: int = 1000,
+    first_seed: int = 0,
+    workers: Annotated[int | None, arg(help="processes; default: all cores")] = None,
+) -> None:
+    """Simulate a dataset of small Kubric-like clips with exact 3D tracks."""
+    from tapip3d_lite.simulate import simulate_dataset
+
+    simulate_dataset(out, count, config, first_seed=first_seed, workers=workers)
+
+
+def samples(out: Path = Path("data_samples")) -> None:
+    """Regenerate the sample clips and their table from seeds."""
+    from tapip3d_lite.simulate.samples import write_samples
+
+    write_samples(out)
+
+
+COMMANDS = {"track": track, "demo": demo, "check": check, "simulate": simulate, "samples": samples}
+
+
+def main() -> None:
+    """Run one command; what the user can mend is one line and exit code 2."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="tapip3d_lite", description=__doc__.splitlines()[0])
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted; what was finished is kept", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()
