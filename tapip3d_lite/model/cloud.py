@@ -1,0 +1,142 @@
+"""The multi-scale feature cloud: at every level a grid of cells, each with a feature and a 3D point; and its scale.
+
+Paper: section 3.2 ("spatio-temporal feature clouds") and appendix (normalisation of coordinates).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of the feature cloud of B x T frames.
+
+    Attributes:
+        features: (B, T, h, w, C).
+        points: (B, T, h, w, 3) in the trajectory's space.
+        valid: (B, T, h, w) bool, whether the cell's depth is known.
+        extra: anything that a context's `prepare` adds for its neighbourhood (e.g. feature planes).
+    """
+
+    features: Tensor
+    points: Tensor
+    valid: Tensor
+    extra: Any = None
+
+    def cut(self, start: int, stop: int) -> Level:
+        """Frames [start, stop)."""
+        return replace(
+            self,
+            features=self.features[:, start:stop],
+            points=self.points[:, start:stop],
+            valid=self.valid[:, start:stop],
+        )
+
+
+def feature_cloud(features: Tensor, points: Tensor, valid: Tensor, levels: int) -> list[Level]:
+    """Pair a pyramid of features with a pyramid of points.
+
+    Features are averaged 2 x 2 from level to level. Points are never averaged, since the mean of a front and a back
+    point lies on neither: each cell takes the point of the full-resolution pixel nearest to its centre.
+
+    Args:
+        features: (B, T, C, h, w).
+        points: (B, T, H, W, 3).
+        valid: (B, T, H, W) bool.
+        levels: L.
+
+    Returns:
+        L levels, finest first.
+    """
+    batch, count = features.shape[:2]
+    maps, cloud = features.flatten(0, 1), []
+    for level in range(levels):
+        maps = F.avg_pool2d(maps, 2) if level else maps
+        rows = nearest_exact(points.shape[2], maps.shape[-2], points.device)
+        columns = nearest_exact(points.shape[3], maps.shape[-1], points.device)
+        cells = maps.movedim(1, -1).unflatten(0, (batch, count))
+        cloud.append(Level(cells, points[:, :, rows][:, :, :, columns], valid[:, :, rows][:, :, :, columns]))
+    return cloud
+
+
+def nearest_exact(source: int, target: int, device: torch.device) -> Tensor:
+    """Indices (target,) of the source pixels nearest to the centres of target cells, rounded as torch's float32 does."""
+    scale = torch.tensor(source / target, dtype=torch.float32, device=device)
+    index = ((torch.arange(target, dtype=torch.float32, device=device) + 0.5) * scale).floor().long()
+    return index.clamp(max=source - 1)
+
+
+@dataclass(frozen=True)
+class Normalizer:
+    """x_norm = (x - mean) / std * scale, of one window.
+
+    Attributes:
+        mean: (B, 1, 1, 3).
+        std: (B, 1, 1, 1) isotropic, or (B, 1, 1, 3).
+        scale: standard deviation of the normalised cloud.
+    """
+
+    mean: Tensor
+    std: Tensor
+    scale: float
+
+    @classmethod
+    def fit(cls, points: Tensor, valid: Tensor, mode: str = "isotropic", scale: float = 1.0) -> Normalizer:
+        """Statistics of the valid points of a window.
+
+        Args:
+            points: (B, S, H, W, 3), in the trajectory's space.
+            valid: (B, S, H, W) bool: depth known and inside the region of interest.
+            mode: `"isotropic"`: one std over points and axes; `"anisotropy"`: one an axis; `"none"`: identity.
+            scale: wanted standard deviation.
+
+        Raises:
+            ValueError: no valid point in a window.
+        """
+        batch = len(points)
+        if mode == "none":
+            return cls(points.new_zeros(batch, 1, 1, 3), points.new_ones(batch, 1, 1, 1), 1.0)
+        weight = valid.flatten(1).unsqueeze(-1)  # (B, P, 1)
+        count = weight.sum(1, keepdim=True)
+        if not bool((count > 0).all()):
+            raise ValueError(
+                "depths: a window has no valid point inside depth_roi, so coordinates have no scale; widen depth_roi"
+            )
+        flat = points.flatten(1, 3)
+        mean = torch.where(weight, flat, 0).sum(1, keepdim=True) / count
+        square = torch.where(weight, flat - mean, 0).square()
+        axes = (1, 2) if mode == "isotropic" else 1
+        total = count * 3 if mode == "isotropic" else count
+        std = (square.sum(axes, keepdim=True) / total).sqrt()
+        return cls(mean[:, None], std[:, None].clamp(min=1e-12), scale)
+
+    def normalize(self, x: Tensor) -> Tensor:
+        """(B, ..., 3) to normalised coordinates."""
+        mean, std = self._like(x)
+        return (x - mean) / std * self.scale
+
+    def restore(self, x: Tensor) -> Tensor:
+        """The inverse of `normalize`."""
+        mean, std = self._like(x)
+        return x / self.scale * std + mean
+
+    def _like(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        shape = (len(x), *[1] * (x.ndim - 2))
+        return self.mean.reshape(*shape, 3), self.std.reshape(*shape, -1)
+
+
+def quantile_roi(depths: Tensor) -> tuple[float, float]:
+    """Depths (any shape) to a region of interest (near, far) = (1e-7, q75 + 1.5 (q75 - q25)), without outliers.
+
+    Quantiles are the k-th smallest valid depth with k = int(0.25 n), int(0.75 n), counted from one.
+    """
+    ordered = depths[depths > 0].sort().values
+    low, high = (float(ordered[max(int(share * len(ordered)), 1) - 1]) for share in (0.25, 0.75))
+    return 1e-7, high + 1.5 * (high - low)

@@ -1,0 +1,206 @@
+"""`TrackerConfig`: every system that the paper compares is one value of this dataclass.
+
+Paper: section 3 (the method), tables 4 to 7 (the ablations; one field each). The defaults are the released model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+CHOICES = {
+    "space": ("uv", "uvd", "uvlogd", "camera", "world"),
+    "neighborhood": ("knn", "window", "planes"),
+    "context": ("n2n", "p2n", "correlation", "planes"),
+    "updater": ("transformer", "temporal"),
+    "norm_mode": ("isotropic", "anisotropy", "none"),
+}
+_SWITCHES = ("space", "neighborhood", "context", "updater")
+_POSITIVE = (
+    "window feature_dim stride levels neighbors token_dim context_heads context_head_dim offset_layers offset_dim hidden "
+    "heads head_dim time_depth space_depth iterations norm_scale context_mlp_ratio mlp_ratio virtual_tracks"
+).split()
+
+Part = str | Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """Sizes and switches of a tracker; frozen, so a checkpoint's config cannot drift from its weights.
+
+    Attributes:
+        space: where a trajectory lives; a name or a `spaces.Space`.
+        neighborhood: which cells a point looks at; a name or a callable (see `neighbors.KNearest`).
+        context: what it makes of them; a name or a `contexts.Context`, as a class or a module.
+        updater: how trajectories are corrected; a name or a module (see `updater.Transformer`), as a class or a module.
+        image_size: (H, W) pixels that the tracker works at.
+        window: S frames that are solved together, even; the next window starts S / 2 later.
+        feature_dim: C, channels of the feature map.
+        stride: pixels per feature cell.
+        center_rgb: map colours to [-1, 1] before the encoder's own centring (a quirk of some released weights).
+        levels: L, resolutions of the feature cloud.
+        norm_mode: one standard deviation for all axes, one an axis, or no normalisation.
+        norm_scale: standard deviation of the normalised cloud.
+        exclude_invalid: keep cells without depth out of the neighbourhoods; the released model leaves them in.
+        neighbors: K, cells in a neighbourhood, beside the query itself on the support side.
+        token_dim: D, width of the neighbourhood tokens.
+        context_heads, context_head_dim, context_mlp_ratio: attention inside the context.
+        offset_layers, offset_dim: the MLP on Fourier-embedded offsets.
+        share_levels: one context for all levels instead of one each.
+        use_features: append the query's own feature to the context.
+        use_uv: append pixel coordinates to the trajectory token.
+        hidden, heads, head_dim, mlp_ratio: the updating transformer.
+        time_depth, space_depth: its blocks over time, and of those the ones followed by blocks over tracks.
+        virtual_tracks: V, learned tracks through which all tracks talk to each other.
+        separate_vis_head: an own linear layer for visibility and (unused) confidence.
+        outputs: 4 = (dx, dy, dz, dvis), or 5 with the unused confidence.
+        iterations: M, updates of a window when the caller names no number.
+
+    Raises:
+        ValueError: a value or combination that cannot work, and why.
+    """
+
+    space: Part = "world"
+    neighborhood: Part = "knn"
+    context: Part = "n2n"
+    updater: Part = "transformer"
+    image_size: tuple[int, int] = (384, 512)
+    window: int = 16
+    feature_dim: int = 128
+    stride: int = 4
+    center_rgb: bool = False
+    levels: int = 4
+    norm_mode: str = "isotropic"
+    norm_scale: float = 1.0
+    exclude_invalid: bool = False
+    neighbors: int = 32
+    token_dim: int = 128
+    context_heads: int = 1
+    context_head_dim: int = 128
+    context_mlp_ratio: float = 1.0
+    offset_layers: int = 3
+    offset_dim: int = 128
+    share_levels: bool = False
+    use_features: bool = False
+    use_uv: bool = True
+    hidden: int = 384
+    heads: int = 8
+    head_dim: int = 48
+    mlp_ratio: float = 4.0
+    time_depth: int = 3
+    space_depth: int = 3
+    virtual_tracks: int = 64
+    separate_vis_head: bool = True
+    outputs: int = 5
+    iterations: int = 6
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "image_size", tuple(int(side) for side in self.image_size))
+        for name, allowed in CHOICES.items():
+            value = getattr(self, name)
+            if value not in allowed if isinstance(value, str) else not (name in _SWITCHES and callable_part(value)):
+                own = ", or a custom part" if name in _SWITCHES else ""
+                raise ValueError(f"TrackerConfig.{name}: expected one of {', '.join(allowed)}{own}; got {value!r}")
+        for name in _POSITIVE:
+            if getattr(self, name) <= 0:
+                raise ValueError(f"TrackerConfig.{name}: expected a positive number, got {getattr(self, name)}")
+        self._check_sizes()
+        self._check_combination()
+
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> TrackerConfig:
+        """The `"paper"` configuration (about 26 M parameters), or `"lite"` for two CPU cores (under 3 M).
+
+        Args:
+            name: `"lite"` or `"paper"`.
+            changes: fields to set differently.
+
+        Raises:
+            ValueError: an unknown preset.
+        """
+        if name not in _PRESETS:
+            raise ValueError(f"TrackerConfig.preset: expected one of {', '.join(_PRESETS)}, got {name!r}")
+        return cls(**(_PRESETS[name] | changes))
+
+    @property
+    def grid_sizes(self) -> list[tuple[int, int]]:
+        """(h, w) of each level of the feature cloud, finest first."""
+        height, width = self.image_size[0] // self.stride, self.image_size[1] // self.stride
+        return [(height >> level, width >> level) for level in range(self.levels)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for a weights file; ValueError where a custom part has no name to save."""
+        for name in _SWITCHES:
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"TrackerConfig.{name} is a custom part and has no name; save its state_dict yourself")
+        return asdict(self) | {"image_size": list(self.image_size)}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> TrackerConfig:
+        """The inverse of `to_dict`; ValueError names unknown fields."""
+        unknown = sorted(set(values) - {field.name for field in fields(cls)})
+        if unknown:
+            raise ValueError(f"TrackerConfig: unknown fields {', '.join(unknown)}; the file is from another version")
+        return cls(**values)
+
+    def replace(self, **changes: Any) -> TrackerConfig:
+        """A copy with some fields changed, checked again."""
+        return replace(self, **changes)
+
+    def _check_sizes(self) -> None:
+        if self.window % 2:
+            raise ValueError(f"TrackerConfig.window: expected an even number of frames, got {self.window}")
+        height, width = self.grid_sizes[-1]
+        if self.neighborhood == "knn" and height * width < self.neighbors:
+            raise ValueError(
+                f"TrackerConfig.neighbors: the coarsest of {self.levels} levels has {height}x{width} cells for images of "
+                f"{self.image_size}, fewer than K = {self.neighbors}; use fewer neighbors or levels, or larger images"
+            )
+        if self.feature_dim % 4:
+            raise ValueError(f"TrackerConfig.feature_dim: expected a multiple of 4, got {self.feature_dim}")
+        if self.time_depth % self.space_depth:
+            raise ValueError(
+                f"TrackerConfig.space_depth: must divide time_depth = {self.time_depth}, got {self.space_depth}"
+            )
+        if self.outputs not in (4, 5) or (self.separate_vis_head and self.outputs != 5):
+            raise ValueError(f"TrackerConfig.outputs: expected 4, or 5 with a confidence, got {self.outputs}")
+
+    def _check_combination(self) -> None:
+        if (self.neighborhood == "planes") != (self.context == "planes") and isinstance(self.context, str):
+            raise ValueError(
+                f"TrackerConfig: neighborhood {self.neighborhood!r} with context {self.context!r}: planes are read only by "
+                "the context 'planes', and it reads nothing else; set both or none"
+            )
+        if self.space == "uv" and self.neighborhood == "planes":
+            raise ValueError("TrackerConfig: three planes need three axes, but space 'uv' has two; use 'uvd'")
+
+
+def callable_part(part: Any) -> bool:
+    """Whether something can stand for a switch: a class, a module, a function, or a space with its methods."""
+    return callable(part) or all(hasattr(part, name) for name in ("lift", "from_world", "to_world", "to_pixels"))
+
+
+_PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {},
+    "lite": {
+        "image_size": (128, 128),
+        "window": 8,
+        "feature_dim": 64,
+        "levels": 3,
+        "neighbors": 12,
+        "token_dim": 64,
+        "context_head_dim": 64,
+        "offset_layers": 2,
+        "offset_dim": 64,
+        "exclude_invalid": True,
+        "hidden": 128,
+        "heads": 4,
+        "head_dim": 32,
+        "mlp_ratio": 2.0,
+        "time_depth": 3,
+        "space_depth": 3,
+        "virtual_tracks": 16,
+        "iterations": 4,
+    },
+}

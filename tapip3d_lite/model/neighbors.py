@@ -1,0 +1,124 @@
+"""Neighbourhoods: the K cells of a frame's cloud that lie nearest to a point in 3D.
+
+Paper: section 3.3 ("local pair attention", k-NN in 3D) and table 6 (against windows in 2D). Two cells that touch in
+the image but lie on different surfaces are far apart here, so a neighbourhood does not mix them.
+
+A neighbourhood is any callable with the signature of `KNearest.forward`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from tapip3d_lite.model.cloud import Level
+from tapip3d_lite.model.config import TrackerConfig
+
+_BUDGET = 2**24  # distances that exist at once: 64 MiB in float32
+
+
+@dataclass(frozen=True)
+class Neighbors:
+    """What stands around points.
+
+    Attributes:
+        features: (..., N, K, C) of the cells.
+        points: (..., N, K, 3) of the cells.
+        center: (..., N, 3), the points whose neighbourhood this is.
+        indices: (..., N, K) into the h * w cells of the frame, or None where cells were interpolated.
+    """
+
+    features: Tensor
+    points: Tensor
+    center: Tensor
+    indices: Tensor | None = None
+
+    @property
+    def offsets(self) -> Tensor:
+        """(..., N, K, 3), cell minus centre."""
+        return self.points - self.center.unsqueeze(-2)
+
+
+class KNearest(nn.Module):
+    """The K cells nearest in 3D, nearest first."""
+
+    def __init__(self, config: TrackerConfig) -> None:
+        super().__init__()
+        self.count, self.exclude_invalid = config.neighbors, config.exclude_invalid
+
+    def forward(self, level: Level, coords: Tensor, cells: Tensor) -> Neighbors:
+        """Collect neighbourhoods.
+
+        Args:
+            level: S frames of one level of the cloud.
+            coords: (B, S, N, 3) in the space of `level.points`.
+            cells: (B, S, N, 2), the same points projected, in units of the level's cells (column, row); may lie
+                outside the grid. Not needed here; windows in 2D are centred on it.
+
+        Returns:
+            (B, S, N, K, ...) neighbours.
+        """
+        shape = coords.shape[:2]
+        points, features = level.points.flatten(2, 3).flatten(0, 1), level.features.flatten(2, 3).flatten(0, 1)
+        valid = level.valid.flatten(2).flatten(0, 1) if self.exclude_invalid else None
+        with torch.no_grad():
+            indices = knn(coords.flatten(0, 1), points, self.count, valid)  # (B*S, N, K)
+        near = (gather(x, indices).unflatten(0, shape) for x in (features, points))
+        return Neighbors(*near, coords, indices.unflatten(0, shape))
+
+
+def gather(values: Tensor, indices: Tensor) -> Tensor:
+    """Rows of values (F, P, C) at indices (F, N, K) as (F, N, K, C)."""
+    frame = torch.arange(len(values), device=values.device)[:, None, None]
+    return values[frame, indices]
+
+
+def knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = None) -> Tensor:
+    """Exact nearest neighbours by squared distance in float32; ties go to the lowest index.
+
+    Args:
+        queries: (F, N, 3), F independent clouds.
+        points: (F, P, 3).
+        count: K, at most P.
+        valid: (F, P) bool, points that may be chosen, or None for all. If fewer than K may, the nearest one
+            fills the remaining slots (index 0 where there is none at all).
+
+    Returns:
+        (F, N, K) int64, nearest first.
+
+    Raises:
+        ValueError: K exceeds P.
+    """
+    if count > points.shape[1]:
+        raise ValueError(f"knn: asked for {count} neighbours among {points.shape[1]} points; lower neighbors or levels")
+    frames, total = points.shape[:2]
+    step = max(1, _BUDGET // (frames * total))
+    chunks = [_nearest(chunk, points, count, valid) for chunk in queries.float().split(step, 1)]
+    return torch.cat(chunks, 1) if chunks else queries.new_zeros((frames, 0, count), dtype=torch.long)
+
+
+def _nearest(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) -> Tensor:
+    distance = squared_distances(queries, points)
+    if valid is not None:
+        distance.masked_fill_(~valid[:, None], torch.inf)
+    near = distance.topk(min(count + 1, points.shape[1]), dim=-1, largest=False)
+    indices = near.indices[..., :count].clone()
+    # topk leaves the order of equal distances open; only rows that contain a tie are sorted again, stably.
+    tied = (near.values[..., 1:] == near.values[..., :-1]).any(-1)
+    if bool(tied.any()):
+        indices[tied] = distance[tied].sort(dim=-1, stable=True).indices[:, :count]
+    if valid is not None:
+        chosen = distance.gather(-1, indices)
+        nearest = torch.where(chosen[..., :1].isinf(), 0, indices[..., :1])
+        indices = torch.where(chosen.isinf(), nearest, indices)
+    return indices
+
+
+def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
+    """(F, N, P) = dx^2 + dy^2 + dz^2; never through |a|^2 + |b|^2 - 2ab, which loses the near ones to rounding."""
+    total = (queries[:, :, None, 0] - points[:, None, :, 0]).square_()
+    for axis in (1, 2):
+        total += (queries[:, :, None, axis] - points[:, None, :, axis]).square_()
+    return total
