@@ -27,17 +27,20 @@ def main() -> int:
     commands = parser.add_subparsers(dest="command", required=True, metavar="setup | lab | test | demo | notebooks")
     commands.add_parser("setup", help="make or update the environment, nothing else")
     lab = commands.add_parser("lab", help="start JupyterLab on the notebooks")
-    lab.add_argument("arguments", nargs=argparse.REMAINDER, help="passed on to JupyterLab, e.g. --no-browser --port 9000")
+    lab.add_argument(
+        "arguments", nargs=argparse.REMAINDER, help="passed on to JupyterLab, e.g. --no-browser --port 9000"
+    )
     test = commands.add_parser("test", help="style, unit tests, then every notebook on the CPU")
-    test.add_argument("arguments", nargs=argparse.REMAINDER, help="passed on to pytest (then the notebooks are left out)")
+    test.add_argument(
+        "arguments", nargs=argparse.REMAINDER, help="passed on to pytest (then the notebooks are left out)"
+    )
     demo = commands.add_parser("demo", help="track a sample clip, write a 3D page and a picture")
-    demo.add_argument("arguments", nargs=argparse.REMAINDER, help="CLIP.npz and options of `python -m tapip3d_lite demo`")
+    demo.add_argument(
+        "arguments", nargs=argparse.REMAINDER, help="CLIP.npz and options of `python -m tapip3d_lite demo`"
+    )
     notebooks = commands.add_parser("notebooks", help="run the notebooks and store their fresh outputs")
     notebooks.add_argument("arguments", nargs=argparse.REMAINDER, help="names, e.g. 01_lifting; default: all")
     chosen = parser.parse_args()
-    if sys.version_info < (3, 10):
-        print(f"Python 3.10 or newer is needed, this is {sys.version.split()[0]}; run it as python3.11 run.py …")
-        return 2
     try:
         setup()
         return globals()[f"run_{chosen.command}"](*getattr(chosen, "arguments", []))

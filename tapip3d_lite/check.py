@@ -1,0 +1,280 @@
+"""`check_clip`: find the usual mix-ups of RGB-D clips from the data alone, with the evidence as a number.
+
+Two facts of a correct clip are tested, and every finding says how far they fail before and after its fix:
+
+- *Consistency.* Most of a scene stands still: pixels lifted from frame t and projected into frame t' must meet the
+  depth stored there. Wrong pose conventions, axes, units and intrinsics break that as soon as the camera moves.
+- *Flatness.* The inverse of z-depth is affine over any plane (1/z = (a u + b v + c) in pixels), so its second
+  differences vanish on floors and walls. Those of the inverse ray length do not. This needs no camera motion.
+
+A camera that never moves carries no evidence about poses and units; then nothing is said about them. Colour order
+(BGR for RGB) cannot be told from the data and is not checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.geometry import invert, pixel_grid, project, unproject
+
+# A fix must leave at most this share of the error, once for each change that it makes.
+_GAIN = 0.4
+_CAP = 0.25  # relative depth errors above this count as this: the point is simply lost
+_NOISE = 0.001  # exact clips stay well below; a mix-up that changes less than this does no harm either
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One suspected mix-up.
+
+    Attributes:
+        name: short key, e.g. `"camera_to_world"`.
+        message: what seems wrong.
+        measure: what the two numbers are.
+        before: the measure as the clip stands.
+        after: the measure once the fix is applied.
+        remedy: what to do, in words.
+        fix: maps the clip to the corrected clip.
+    """
+
+    name: str
+    message: str
+    measure: str
+    before: float
+    after: float
+    remedy: str
+    fix: Callable[[Clip], Clip]
+
+    def __str__(self) -> str:
+        numbers = f"{self.measure}: {self.before:.4g} as given, {self.after:.4g} after the fix"
+        return f"{self.name}: {self.message} ({numbers}). {self.remedy}"
+
+
+def check_clip(clip: Clip) -> list[Finding]:
+    """Findings for a clip, most basic first; an empty list where nothing is suspicious.
+
+    Args:
+        clip: any clip; ground truth is not used.
+
+    Returns:
+        One `Finding` for each mix-up in the simplest set of fixes that makes the clip consistent. Applying them in
+        the order given repairs the clip.
+    """
+    findings = [*_wrong_intrinsics(clip)]
+    repaired = _apply(clip, findings)
+    ray = _ray_length(repaired)
+    if ray is not None:
+        findings.append(ray)
+        repaired = ray.fix(repaired)
+    return findings + _wrong_motion(repaired)
+
+
+def consistency(clip: Clip, samples: int = 1500, pairs: int = 8) -> float:
+    """Static-scene error: median relative depth error of points carried between frames, averaged over frame pairs.
+
+    Args:
+        clip: the clip.
+        samples: pixels lifted per pair.
+        pairs: frame pairs, spread over the clip at growing gaps.
+
+    Returns:
+        0 for a perfect static scene; at most 0.25, the value of a point that is lost altogether.
+    """
+    rng = np.random.default_rng(0)
+    return float(np.mean([_carry(clip, t, s, samples, rng) for t, s in _frame_pairs(len(clip), pairs)] or [0.0]))
+
+
+def flatness(clip: Clip, frames: int = 4) -> float:
+    """Lower quartile of the relative second differences of inverse depth: near 0 where scenes hold planes.
+
+    Args:
+        clip: the clip.
+        frames: how many frames to look at.
+
+    Returns:
+        The quartile over pixels, dimensionless; the step is a twelfth of the image.
+    """
+    step = max(1, min(clip.size) // 12)
+    values = [_second_differences(clip.depths[t], step) for t in np.linspace(0, len(clip) - 1, frames).astype(int)]
+    values = np.concatenate(values)
+    return float(np.quantile(values, 0.25)) if values.size else 0.0
+
+
+def _frame_pairs(frames: int, pairs: int) -> list[tuple[int, int]]:
+    gaps = sorted({max(1, round(frames * share)) for share in (0.1, 0.25, 0.5)})
+    chosen = [(t, t + gap) for gap in gaps for t in np.linspace(0, max(frames - gap - 1, 0), pairs // 2).astype(int)]
+    return [(t, s) for t, s in dict.fromkeys(chosen) if s < frames]
+
+
+def _carry(clip: Clip, t: int, s: int, samples: int, rng: np.random.Generator) -> float:
+    """Median capped depth error of pixels of frame t seen from frame s."""
+    v, u = np.nonzero(clip.depths[t])
+    if not len(v):
+        return 0.0
+    pick = rng.integers(0, len(v), samples)
+    uv = np.stack([u[pick], v[pick]], -1).astype(np.float64)
+    cameras = [clip.intrinsics[[t, s]].astype(np.float64), clip.extrinsics[[t, s]].astype(np.float64)]
+    points = unproject(uv, clip.depths[t, v[pick], u[pick]].astype(np.float64), cameras[0][0], cameras[1][0])
+    target, z = project(points, cameras[0][1], cameras[1][1])
+    seen = _bilinear_inverse(clip.depths[s], target)
+    inside = np.isfinite(seen) & (z > 0)
+    error = np.full(samples, _CAP)
+    error[inside] = np.minimum(np.abs(z[inside] * seen[inside] - 1), _CAP)
+    invalid = np.isnan(seen)  # it landed on a pixel without depth, which speaks neither for nor against
+    return float(np.median(error[~invalid])) if (~invalid).sum() > samples // 20 else _CAP
+
+
+def _bilinear_inverse(depth: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """1/z at sub-pixel positions (exact on planes): NaN on invalid depth, infinite outside the image."""
+    height, width = depth.shape
+    with np.errstate(divide="ignore"):
+        inverse = np.where(depth > 0, 1 / depth.astype(np.float64), np.nan)
+    inside = ((uv >= 0) & (uv <= (width - 1, height - 1))).all(-1)
+    safe = np.where(inside[:, None], uv, 0)
+    u0, v0 = np.minimum(safe.astype(int), (width - 2, height - 2)).T
+    a, b = safe[:, 0] - u0, safe[:, 1] - v0
+    top = inverse[v0, u0] * (1 - a) + inverse[v0, u0 + 1] * a
+    bottom = inverse[v0 + 1, u0] * (1 - a) + inverse[v0 + 1, u0 + 1] * a
+    return np.where(inside, top * (1 - b) + bottom * b, np.inf)
+
+
+def _second_differences(depth: np.ndarray, step: int) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        inverse = np.where(depth > 0, 1 / depth.astype(np.float64), np.nan)
+    horizontal = inverse[:, 2 * step :] + inverse[:, : -2 * step] - 2 * inverse[:, step:-step]
+    vertical = inverse[2 * step :] + inverse[: -2 * step] - 2 * inverse[step:-step]
+    relative = [horizontal / inverse[:, step:-step], vertical / inverse[step:-step]]
+    values = np.abs(np.concatenate([r.ravel() for r in relative]))
+    return values[np.isfinite(values)]
+
+
+def _wrong_intrinsics(clip: Clip) -> Iterator[Finding]:
+    """The principal point says which image the intrinsics were made for: it lies near the middle of nearly all."""
+    height, width = clip.size
+    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    point = np.median(clip.intrinsics[:, :2, 2], axis=0).astype(np.float64)
+    focal = float(np.median(clip.intrinsics[:, 0, 0]))
+    offset = float(np.abs(point / centre - 1).max())
+    if focal < width / 20 and (np.abs(point) < 2).all():
+        size = np.array([width, height])
+        scaled = _with_intrinsics(size, -0.5)
+        message = f"intrinsics look normalised: fx = {focal:.3g} for an image {width} pixels wide"
+        remedy = "Multiply row 0 by W and row 1 by H, then subtract 0.5 from cx and cy."
+        name = "normalised_intrinsics"
+    elif offset > 0.35 and np.ptp(np.log((point / centre).clip(1e-6))) < 0.3:
+        ratio = centre / point
+        scaled = _with_intrinsics(ratio, 0.0)
+        size = np.rint(2 * point + 1).astype(int)
+        message = f"intrinsics look made for a {size[0]}x{size[1]} image, the video is {width}x{height}"
+        remedy = f"Multiply row 0 by {ratio[0]:.4g} and row 1 by {ratio[1]:.4g} (geometry.resize_intrinsics)."
+        name = "intrinsics_of_another_size"
+    else:
+        return
+    fixed = np.median(scaled(clip).intrinsics[:, :2, 2], axis=0)
+    after = float(np.abs(fixed / centre - 1).max())
+    yield Finding(
+        name, message, "principal point's distance from the centre, in half images", offset, after, remedy, scaled
+    )
+
+
+def _with_intrinsics(scale: np.ndarray, shift: float) -> Callable[[Clip], Clip]:
+    def fix(clip: Clip) -> Clip:
+        matrix = clip.intrinsics.copy()
+        matrix[:, :2] *= np.asarray(scale, np.float32)[:, None]
+        matrix[:, :2, 2] += shift
+        return _rebuilt(clip, intrinsics=matrix)
+
+    return fix
+
+
+def _ray_length(clip: Clip) -> Finding | None:
+    fixed = _ray_to_z(clip)
+    before, after = flatness(clip), flatness(fixed)
+    if before < 2e-4 or after > 0.3 * before:
+        return None
+    remedy = "Divide the depth by |K^-1 (u, v, 1)| of each pixel."
+    message = "depths look like ray lengths, not z: planes bulge"
+    return Finding("ray_length", message, "curvature of planes in 1/depth", before, after, remedy, _ray_to_z)
+
+
+def _ray_to_z(clip: Clip) -> Clip:
+    height, width = clip.size
+    uv = pixel_grid(height, width, clip.depths).reshape(-1, 2)
+    rays = unproject(uv, np.ones(len(uv), np.float32), clip.intrinsics)
+    return _rebuilt(clip, depths=clip.depths / np.linalg.norm(rays, axis=-1).reshape(clip.depths.shape))
+
+
+def _flip(clip: Clip) -> Clip:
+    return _rebuilt(clip, extrinsics=np.diag([1, -1, -1, 1]).astype(np.float32) @ clip.extrinsics)
+
+
+def _inverse(clip: Clip) -> Clip:
+    return _rebuilt(clip, extrinsics=invert(clip.extrinsics))
+
+
+def _depth_scale(factor: float) -> Callable[[Clip], Clip]:
+    return lambda clip: _rebuilt(clip, depths=clip.depths * np.float32(factor))
+
+
+def _translation_scale(clip: Clip) -> Clip:
+    extrinsics = clip.extrinsics.copy()
+    extrinsics[:, :3, 3] *= 1e-3
+    return _rebuilt(clip, extrinsics=extrinsics)
+
+
+# (name, message, remedy, fix); a pose fix and a unit fix may be needed together.
+_POSES = [
+    ("camera_to_world", "extrinsics look camera-to-world", "Invert every matrix (geometry.invert).", _inverse),
+    (
+        "opengl_axes",
+        "cameras look along -z with y up (OpenGL, Blender)",
+        "Multiply extrinsics from the left by diag(1, -1, -1, 1).",
+        _flip,
+    ),
+]
+_UNITS = [
+    (
+        "depth_in_millimetres",
+        "depths are 1000 times too large for the poses",
+        "Multiply depths by 0.001.",
+        _depth_scale(1e-3),
+    ),
+    (
+        "poses_in_millimetres",
+        "translations are 1000 times too large for the depths",
+        "Multiply translations by 0.001.",
+        _translation_scale,
+    ),
+]
+
+
+def _wrong_motion(clip: Clip) -> list[Finding]:
+    """The simplest set of pose and unit fixes that makes the static scene consistent, if it is not."""
+    before = consistency(clip)
+    if before < _NOISE:
+        return []
+    poses = [[], [_POSES[0]], [_POSES[1]], _POSES]
+    units = [[], [_UNITS[0]], [_UNITS[1]]]
+    scored = []
+    for fixes in ([*p, *u] for p, u in product(poses, units)):
+        error = consistency(_apply(clip, fixes))
+        scored.append((error / _GAIN ** len(fixes), error, fixes))
+    _, after, fixes = min(scored, key=lambda row: row[0])
+    measure = "relative depth error of the static scene"
+    return [Finding(n, m, measure, before, after, remedy, fix) for n, m, remedy, fix in fixes]
+
+
+def _apply(clip: Clip, fixes: list) -> Clip:
+    for fix in fixes:
+        clip = (fix.fix if isinstance(fix, Finding) else fix[-1])(clip)
+    return clip
+
+
+def _rebuilt(clip: Clip, **changes: np.ndarray) -> Clip:
+    # World-space queries and tracks belong to the old cameras: a repaired clip starts without them.
+    return replace(clip, queries=None, tracks=None, **changes)
