@@ -1,0 +1,9 @@
+"""Small Kubric-like clips with exact truth: MuJoCo throws the bodies, ray casting gives colour, depth and visibility."""
+
+from __future__ import annotations
+
+from tapip3d_lite.simulate.config import SimulationConfig
+from tapip3d_lite.simulate.dataset import simulate_dataset
+from tapip3d_lite.simulate.simulator import simulate_clip
+
+__all__ = ["SimulationConfig", "simulate_clip", "simulate_dataset"]

@@ -1,0 +1,152 @@
+"""A random scene: which bodies there are, where they start, how fast they fly, and what everything is painted with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from tapip3d_lite.simulate.config import PRIMITIVES, SimulationConfig
+from tapip3d_lite.simulate.meshes import MESHES
+from tapip3d_lite.simulate.textures import Texture, random_texture
+
+DOME_RADIUS = 11.0
+HIDDEN_GROUP = 1  # the backdrop's geom group: it is seen by the camera, but throws no shadow
+
+
+@dataclass(frozen=True)
+class Body:
+    """One body as it starts: `half` are its half extents in metres, `fixed` bodies never move."""
+
+    shape: str
+    half: np.ndarray
+    position: np.ndarray
+    quaternion: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+    texture: Texture
+    moving: bool
+    fixed: bool = False
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled MuJoCo model with what it lacks: starting velocities, textures and light.
+
+    Attributes:
+        model: geoms in the order floor, (backdrop,) bodies.
+        bodies: in the order of the model's last geoms.
+        textures: one per geom.
+        clouds: (12, 4) waves of the sky.
+        sun: (3,) unit vector towards the sun.
+        sun_color, ambient: (3,) linear RGB.
+    """
+
+    model: mujoco.MjModel
+    bodies: tuple[Body, ...]
+    textures: tuple[Texture, ...]
+    clouds: np.ndarray
+    sun: np.ndarray
+    sun_color: np.ndarray
+    ambient: np.ndarray
+
+    @property
+    def first_body(self) -> int:
+        """The geom index of the first body."""
+        return self.model.ngeom - len(self.bodies)
+
+
+def random_scene(rng: np.random.Generator, config: SimulationConfig, azimuth: float) -> Scene:
+    """Draw a scene; `azimuth` (radians) is the camera's mean direction, where an occluder has to stand."""
+    floor, behind = random_texture(rng, scale=2.0), random_texture(rng, scale=4.0)
+    shared = random_texture(rng) if config.same_texture else None
+    resting = int(rng.integers(config.resting[0], config.resting[1] + 1))
+    moving = int(rng.integers(config.moving[0], config.moving[1] + 1))
+    bodies = [_occluder(rng, azimuth)] if config.occluder else []
+    for index in range(resting + moving):
+        bodies.append(_random_body(rng, config, index >= resting, bodies, shared))
+    environment = [floor] if config.sky else [floor, behind]
+    height, around = rng.uniform(0.75, 1.2), rng.uniform(0, 2 * np.pi)
+    sun = np.array([np.cos(around) * np.cos(height), np.sin(around) * np.cos(height), np.sin(height)])
+    warmth = rng.uniform(0, 0.12)
+    return Scene(
+        model=_compile(rng, config, bodies),
+        bodies=tuple(bodies),
+        textures=(*environment, *(body.texture for body in bodies)),
+        clouds=np.concatenate([rng.normal(size=(12, 3)) * 2, rng.uniform(0, 2 * np.pi, (12, 1))], -1),
+        sun=sun,
+        sun_color=rng.uniform(0.75, 0.95) * np.array([1 + warmth, 1.0, 1 - warmth]),
+        ambient=rng.uniform(0.32, 0.45) * np.array([1 - warmth / 2, 1.0, 1 + warmth / 2]),
+    )
+
+
+def _random_body(
+    rng: np.random.Generator, config: SimulationConfig, moving: bool, others: list[Body], shared: Texture | None
+) -> Body:
+    shape = config.shapes[rng.integers(len(config.shapes))]
+    half = rng.uniform(0.28, 0.55) * (1 if shape in MESHES else rng.uniform(0.65, 1, 3))
+    half = np.broadcast_to(half, 3)
+    for _ in range(50):
+        position = _start(rng, config, moving, float(half.max()))
+        reach = [np.linalg.norm(position - o.position) - 1.3 * (o.half.max() + half.max()) for o in others]
+        if min(reach, default=1.0) > 0:
+            break
+    velocity, spin = np.zeros(3), np.zeros(3)
+    if moving:
+        target = rng.uniform(-0.8, 0.8, 2)
+        velocity[:2] = (target - position[:2]) * rng.uniform(0.5, 1.8) * config.speed
+        velocity[2] = rng.uniform(-1, 2.0) * config.speed
+        spin = rng.normal(0, 3.5, 3) * config.speed
+    quaternion = rng.normal(size=4)
+    texture = shared or random_texture(rng)
+    return Body(shape, half, position, quaternion / np.linalg.norm(quaternion), velocity, spin, texture, moving)
+
+
+def _start(rng: np.random.Generator, config: SimulationConfig, moving: bool, radius: float) -> np.ndarray:
+    around = rng.uniform(0, 2 * np.pi)
+    distance = rng.uniform(0.4, 2.4) if moving else 2.0 * np.sqrt(rng.uniform())
+    height = radius + rng.uniform(0.2, 2.2) * config.drop if moving else radius * 1.05
+    return np.array([np.cos(around) * distance, np.sin(around) * distance, height])
+
+
+def _occluder(rng: np.random.Generator, azimuth: float) -> Body:
+    half = np.array([0.15, rng.uniform(0.9, 1.2), rng.uniform(0.9, 1.2)])
+    position = np.array([np.cos(azimuth) * 2.2, np.sin(azimuth) * 2.2, half[2]])
+    turn = azimuth + rng.uniform(-0.2, 0.2)
+    quaternion = np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)])
+    return Body("box", half, position, quaternion, np.zeros(3), np.zeros(3), random_texture(rng), False, fixed=True)
+
+
+def _compile(rng: np.random.Generator, config: SimulationConfig, bodies: list[Body]) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    extent = 40 if config.sky else 0  # 0 is endless; under the sky the floor must end before depths become absurd
+    floor = dict(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[extent, extent, 1])
+    spec.worldbody.add_geom(**floor, friction=[0.7, 0.01, 0.003])
+    if not config.sky:
+        dome = dict(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[DOME_RADIUS] * 3, contype=0, conaffinity=0)
+        spec.worldbody.add_geom(**dome, group=HIDDEN_GROUP)
+    for index, body in enumerate(bodies):
+        node = spec.worldbody.add_body(pos=body.position, quat=body.quaternion)
+        if not body.fixed:
+            node.add_freejoint()
+        solid = dict(density=400, friction=[rng.uniform(0.3, 0.8), 0.01, 0.003])
+        # A short, underdamped contact: bodies bounce a little, as thrown toys do.
+        solid["solref"] = [0.02, rng.uniform(0.25, 0.8)]
+        node.add_geom(**solid, **_geometry(rng, spec, body, index))
+    return spec.compile()
+
+
+def _geometry(rng: np.random.Generator, spec: mujoco.MjSpec, body: Body, index: int) -> dict:
+    if body.shape in PRIMITIVES:
+        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{body.shape.upper()}")
+        half = body.half
+        if body.shape == "capsule":  # its second size is half the straight part
+            half = np.array([half.min() * 0.6, half.max() * 0.6, 0])
+        return dict(type=kind, size=half)
+    vertices, faces = MESHES[body.shape](rng)
+    mesh = spec.add_mesh(name=f"mesh{index}")
+    mesh.uservert = (vertices * body.half).ravel()
+    mesh.userface = np.asarray(faces).ravel()
+    return dict(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
