@@ -41,6 +41,9 @@ def main() -> int:
     notebooks = commands.add_parser("notebooks", help="run the notebooks and store their fresh outputs")
     notebooks.add_argument("arguments", nargs=argparse.REMAINDER, help="names, e.g. 01_lifting; default: all")
     chosen = parser.parse_args()
+    if sys.version_info < (3, 10):  # noqa: UP036 (run.py is what an older Python meets first)
+        print(f"Python 3.10 or newer is needed, this is {sys.version.split()[0]}; try python3.11 run.py …")
+        return 2
     try:
         setup()
         return globals()[f"run_{chosen.command}"](*getattr(chosen, "arguments", []))
