@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 
-
 @dataclass(frozen=True)
 class Level:
     """One level of the feature cloud of B x T frames.

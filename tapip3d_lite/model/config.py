@@ -17,10 +17,28 @@ CHOICES = {
     "norm_mode": ("isotropic", "anisotropy", "none"),
 }
 _SWITCHES = ("space", "neighborhood", "context", "updater")
-_POSITIVE = (
-    "window feature_dim stride levels neighbors token_dim context_heads context_head_dim offset_layers offset_dim hidden "
-    "heads head_dim time_depth space_depth iterations norm_scale context_mlp_ratio mlp_ratio virtual_tracks"
-).split()
+_POSITIVE = [
+    "window",
+    "feature_dim",
+    "stride",
+    "levels",
+    "neighbors",
+    "token_dim",
+    "context_heads",
+    "context_head_dim",
+    "offset_layers",
+    "offset_dim",
+    "hidden",
+    "heads",
+    "head_dim",
+    "time_depth",
+    "space_depth",
+    "iterations",
+    "norm_scale",
+    "context_mlp_ratio",
+    "mlp_ratio",
+    "virtual_tracks",
+]
 
 Part = str | Callable[..., Any]
 

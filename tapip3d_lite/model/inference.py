@@ -1,0 +1,121 @@
+"""Tracking one clip as a user wants it: any image size, both directions in time, helped by a grid of other points.
+
+Paper: section 4 (protocol): a grid of support queries, depth's region of interest, a second pass backward in time.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.model.cloud import quantile_roi
+from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
+from tapip3d_lite.queries import grid_queries, resolve_queries
+
+if TYPE_CHECKING:
+    from tapip3d_lite.model.tracker import Tracker
+
+_INTERCHANGEABLE = ("camera", "world")
+
+
+@torch.no_grad()
+def track(
+    tracker: Tracker,
+    clip: Clip,
+    queries: np.ndarray | None = None,
+    space: str | None = None,
+    iterations: int | None = None,
+    support_grid: int = 16,
+    bidirectional: bool = True,
+    depth_roi: str | tuple[float, float] | None = "auto",
+    visible_threshold: float = 0.9,
+    progress: bool = False,
+) -> Tracks:
+    """Track points through a clip.
+
+    Args:
+        tracker: the model.
+        clip: T frames of any image size; resized to the model's.
+        queries: (N, 4) rows (t, x, y, z), world; None: the clip's own, else a grid on the first frame.
+        space: `"camera"` or `"world"` in place of the config's, if that is one of the two.
+        iterations: M, the config's if None.
+        support_grid: side of a grid of extra queries on the first frame (on the last one for the backward pass) that
+            are tracked along and dropped; 0: none.
+        bidirectional: also track backward from queries after the first frame; otherwise frames before a query hold
+            whatever the first window that contains it says.
+        depth_roi: depths (near, far) that count for the scale; `"auto"`: up to q75 + 1.5 IQR of the clip; None: all.
+        visible_threshold: a point counts as visible from this probability on.
+        progress: show a bar.
+
+    Returns:
+        The tracks in world coordinates, in the order of the queries.
+
+    Raises:
+        ValueError: queries outside the clip, a space that the model was not made for, or a bad option.
+    """
+    _check_options(tracker, space, visible_threshold, support_grid)
+    queries = resolve_queries(clip, queries)
+    clip = resize_clip(clip, tracker.config.image_size)
+    frames = frames_from_clip(clip, device=next(tracker.parameters()).device)
+    features = tracker.encoder(frames.rgb)
+    roi = quantile_roi(frames.depths) if isinstance(depth_roi, str) else depth_roi
+    options = {"iterations": iterations, "space": space, "depth_roi": roi}
+    grids = [_grid(clip, support_grid, frame) for frame in (0, len(clip) - 1)]
+    backward = bidirectional and bool((queries[:, 0] > 0).any())
+    with _bar(progress, tracker, len(clip), iterations, 1 + backward) as bar:
+        xyz, logits = _one_way(tracker, frames, features, queries, grids[0], options, bar)
+        if backward:
+            flipped = [_flip_time(rows, len(clip)) for rows in (queries, grids[1])]
+            other = _one_way(tracker, frames.flip(), features.flip(1), *flipped, options, bar)
+            before = np.arange(len(clip))[:, None] < queries[:, 0]
+            xyz = np.where(before[..., None], other[0][::-1], xyz)
+            logits = np.where(before, other[1][::-1], logits)
+    visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= visible_threshold
+    return Tracks(xyz, visible, queries, logits)
+
+
+def _one_way(
+    tracker: Tracker, frames: Frames, features: Tensor, queries: np.ndarray, grid: np.ndarray, options: dict, bar: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    rows = torch.from_numpy(np.concatenate([queries, grid]).astype(np.float32)).to(frames.depths.device)
+    handle = tracker.updater.register_forward_hook(lambda *_: bar.update())
+    try:
+        xyz, logits = tracker(frames, rows[None], features=features, **options)
+    finally:
+        handle.remove()
+    return xyz[0, :, : len(queries)].cpu().numpy(), logits[0, :, : len(queries)].cpu().numpy()
+
+
+def _grid(clip: Clip, side: int, frame: int) -> np.ndarray:
+    return grid_queries(clip, side, frame) if side else np.zeros((0, 4), np.float32)
+
+
+def _flip_time(rows: np.ndarray, frames: int) -> np.ndarray:
+    rows = rows.copy()
+    rows[:, 0] = frames - 1 - rows[:, 0]
+    return rows
+
+
+def _bar(show: bool, tracker: Tracker, frames: int, iterations: int | None, passes: int) -> Any:
+    from tqdm.auto import tqdm
+
+    half = tracker.config.window // 2
+    windows = max(0, -(-frames // half) - 1)
+    total = windows * (iterations or tracker.config.iterations) * passes
+    return tqdm(total=total, disable=not show, desc="tracking")
+
+
+def _check_options(tracker: Tracker, space: str | None, threshold: float, grid: int) -> None:
+    own = tracker.config.space
+    if space not in (None, own) and not (own in _INTERCHANGEABLE and space in _INTERCHANGEABLE):
+        raise ValueError(
+            f"space: this tracker was made for {own!r}, got {space!r}; only camera and world are exchangeable"
+        )
+    if not 0 <= threshold <= 1:
+        raise ValueError(f"visible_threshold: expected a probability in [0, 1], got {threshold}")
+    if grid < 0:
+        raise ValueError(f"support_grid: expected 0 or more, got {grid}")

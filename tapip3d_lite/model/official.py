@@ -1,0 +1,195 @@
+"""The authors' checkpoints: their configuration and parameter names to ours.
+
+The mapping is strict: what is not understood raises, since a silently ignored option would change the numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.fourier import time_embedding
+from tapip3d_lite.model.tracker import Tracker
+
+_PLAIN = {  # their key -> our field, and their default
+    "seq_len": ("window", None),
+    "corr_levels": ("levels", 4),
+    "norm_mode": ("norm_mode", "none"),
+    "norm_scale": ("norm_scale", 1.0),
+    "use_uv_input": ("use_uv", False),
+    "center_rgb": ("center_rgb", False),
+    "encoder.output_dim": ("feature_dim", None),
+    "encoder.stride": ("stride", None),
+    "corr_feature.k_neighbors": ("neighbors", None),
+    "corr_feature.posenc_mlp_dim": ("offset_dim", None),
+    "corr_feature.posenc_mlp_layers": ("offset_layers", None),
+    "corr_feature.transformer_dim": ("token_dim", None),
+    "corr_feature.transformer_num_heads": ("context_heads", None),
+    "corr_feature.transformer_head_dim": ("context_head_dim", None),
+    "corr_feature.transformer_mlp_ratio": ("context_mlp_ratio", None),
+    "corr_feature.use_features": ("use_features", False),
+    "corr_feature.share_weights_across_levels": ("share_levels", False),
+    "point_updater.space_depth": ("space_depth", None),
+    "point_updater.time_depth": ("time_depth", None),
+    "point_updater.hidden_size": ("hidden", None),
+    "point_updater.num_heads": ("heads", None),
+    "point_updater.output_dim": ("outputs", None),
+    "point_updater.mlp_ratio": ("mlp_ratio", None),
+    "point_updater.num_virtual_tracks": ("virtual_tracks", None),
+    "point_updater.linear_layer_for_vis_conf": ("separate_vis_head", False),
+}
+_REQUIRED = {  # options that we have in one value only
+    "name": ("point_tracker_3d", "point_tracker_3d_local"),
+    "encoder.name": ("cotracker_cnn",),
+    "corr_feature.name": ("knn_corr_4d", "knn_corr_4d_optimized"),
+    "corr_feature.use_absolute_pos": (False,),
+    "corr_feature.better_depth_downsample": (True,),
+    "corr_feature._clip_depth": (None, False),
+    "point_updater.name": ("efficient_updateformer",),
+    "point_updater.add_space_attn": (True,),
+    "use_local_pos_input": (False,),
+    "relative": (False,),
+}
+_IGNORED = {  # without meaning for inference, or restated by other options
+    "image_size",
+    "eval_mode",
+    "scale_aug",
+    "find_knn_in_normalized_space",
+    "encoder.pretrained",
+    "encoder.freeze_mode",
+    "point_updater.input_dim",
+}
+
+
+def from_official_state(cfg: Mapping[str, Any], state: Mapping[str, Tensor]) -> Tracker:
+    """Build the tracker that a released checkpoint describes.
+
+    Args:
+        cfg: the checkpoint's configuration as plain mappings: `model`, and `train_dataset.resolution` unless
+            `model.image_size` is given.
+        state: parameters under the authors' names.
+
+    Returns:
+        The tracker in evaluation mode; its space is `"world"`, and `"camera"` serves as well.
+
+    Raises:
+        ValueError: options or parameters that are unknown, missing or of another shape, by name.
+    """
+    tracker = Tracker(official_config(cfg))
+    state = dict(state)
+    _check_time(tracker, state.pop("time_emb", None))
+    names = parameter_names(tracker)
+    own = tracker.state_dict()
+    missing, unknown = sorted(set(names) - set(state)), sorted(set(state) - set(names))
+    if missing or unknown:
+        raise ValueError(
+            f"state: missing parameters: {', '.join(missing) or 'none'}; unknown parameters: {', '.join(unknown) or 'none'}"
+        )
+    values = {ours: _fit(theirs, state[theirs], own[ours]) for theirs, ours in names.items()}
+    tracker.load_state_dict(values)
+    return tracker.eval()
+
+
+def official_config(cfg: Mapping[str, Any]) -> TrackerConfig:
+    """Translate the authors' configuration; ValueError names options that cannot be honoured."""
+    if "model" not in cfg:
+        raise ValueError(f"cfg: expected a key 'model', got {', '.join(map(str, cfg)) or 'an empty mapping'}")
+    flat = {k: v for k, v in _flatten(cfg["model"]).items() if k not in _IGNORED}
+    for key, allowed in _REQUIRED.items():
+        value = flat.pop(key, allowed[0])
+        if value not in allowed:
+            raise ValueError(f"cfg.model.{key}: only {' or '.join(map(repr, allowed))} is supported, got {value!r}")
+    ours = {}
+    for key, (field, default) in _PLAIN.items():
+        value = flat.pop(key, default)
+        if value is None:
+            raise ValueError(f"cfg.model.{key}: missing")
+        ours[field] = value
+    if flat:
+        raise ValueError(f"cfg.model: unknown options {', '.join(sorted(flat))}; they might change the numbers")
+    size = cfg["model"].get("image_size") or cfg.get("train_dataset", {}).get("resolution")
+    if size is None:
+        raise ValueError("cfg: the image size is missing; expected train_dataset.resolution = (H, W)")
+    return TrackerConfig(image_size=tuple(size), space="world", exclude_invalid=False, head_dim=48, **ours)
+
+
+def parameter_names(tracker: Tracker) -> dict[str, str]:
+    """The authors' parameter names, each with ours."""
+    return {_their_name(name): name for name in tracker.state_dict()}
+
+
+_RENAMES = (  # our prefix -> theirs; the first that fits wins, then the rest of the name goes on
+    ("encoder.stem.", "encoder.backbone.conv1."),
+    ("encoder.fuse.", "encoder.backbone.conv2."),
+    ("encoder.head.", "encoder.backbone.conv3."),
+    ("context.embed.norm.", "corr_processor.in_norm."),
+    ("context.embed.project.", "corr_processor.feat_transform."),
+    ("context.embed.offsets.", "corr_processor.posenc_mlps."),
+    ("context.pairs.", "corr_processor.transformers."),
+    ("updater.input.", "point_updater.input_transform."),
+    ("updater.virtual", "point_updater.virual_tracks"),
+    ("updater.time.", "point_updater.time_blocks."),
+    ("updater.gather.", "point_updater.space_virtual2point_blocks."),
+    ("updater.mix.", "point_updater.space_virtual_blocks."),
+    ("updater.scatter.", "point_updater.space_point2virtual_blocks."),
+    ("updater.head.", "point_updater.flow_head."),
+    ("updater.vis_head.", "point_updater.vis_conf_head."),
+)
+_PARTS = (  # inside a context
+    ("support_from_context", "xblock1_2"),
+    ("context_from_support", "xblock2_1"),
+    ("pool_support.token", "output_token_1"),
+    ("pool_context.token", "output_token_2"),
+    ("pool_support.attention", "aggr1"),
+    ("pool_context.attention", "aggr2"),
+    (".mlp.0.", ".mlp.fc1."),
+    (".mlp.2.", ".mlp.fc2."),
+    (".skip.", ".downsample.0."),
+)
+
+
+def _their_name(name: str) -> str:
+    if name.startswith("encoder.stages."):
+        _, _, stage, rest = name.split(".", 3)
+        name = f"encoder.backbone.layer{int(stage) + 1}.{rest}"
+    for ours, theirs in _RENAMES:
+        if name.startswith(ours):
+            name = theirs + name[len(ours) :]
+    for ours, theirs in _PARTS:
+        name = name.replace(ours, theirs)
+    crosses = "xblock" in name or "2point_blocks" in name or "2virtual_blocks" in name
+    return name.replace(".attention.", ".cross_attn." if crosses else ".attn.")
+
+
+def _fit(name: str, value: Tensor, own: Tensor) -> Tensor:
+    if name == "point_updater.virual_tracks":
+        value = value.transpose(1, 2) if value.ndim == 4 else value  # (1, V, 1, U) -> (1, 1, V, U)
+    if value.shape != own.shape:
+        raise ValueError(
+            f"state[{name!r}]: expected shape {tuple(own.shape)}, got {tuple(value.shape)}; cfg does not fit"
+        )
+    return value.float()
+
+
+def _check_time(tracker: Tracker, value: Tensor | None) -> None:
+    expected = time_embedding(*tracker.time.shape)
+    if (
+        value is None
+        or value.shape[1:] != expected.shape
+        or not torch.allclose(value[0].float().cpu(), expected, atol=1e-5)
+    ):
+        got = "nothing" if value is None else f"shape {tuple(value.shape)}"
+        raise ValueError(
+            f"state['time_emb']: expected sinusoids of shape (1, {', '.join(map(str, expected.shape))}), got {got}"
+        )
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat = {}
+    for key, value in values.items():
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat

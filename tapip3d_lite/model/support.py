@@ -1,0 +1,92 @@
+"""The support side: each query's own neighbourhood, in the frame where it was asked.
+
+Paper: section 3.3. It is collected once a call, in un-normalised coordinates; only offsets are re-normalised later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from tapip3d_lite.model.cloud import Level
+from tapip3d_lite.model.neighbors import Neighbors
+
+if TYPE_CHECKING:
+    from tapip3d_lite.model.tracker import Scene
+
+
+def query_support(
+    neighborhood: Callable[..., Neighbors], scene: Scene, times: Tensor, coords: Tensor
+) -> list[Neighbors]:
+    """Neighbourhoods of queries, the query itself first.
+
+    Args:
+        neighborhood: as `neighbors.KNearest`.
+        scene: T frames.
+        times: (B, N) int64 query frames.
+        coords: (B, N, 3) queries in the scene's space.
+
+    Returns:
+        For each level (B, N, 1 + K, ...): row 0 is the query, with the bilinear feature at its pixel and index -1.
+    """
+    groups = []  # (frame, columns queried there in any batch element, their cells' pixels)
+    for frame in times.unique().tolist():
+        columns = (times == frame).any(0).nonzero()[:, 0]
+        here = scene.frames.cut(frame, frame + 1)
+        uv = scene.space.to_pixels(coords[:, None, columns], here.intrinsics, here.extrinsics)
+        groups.append((frame, columns, uv))
+    return [_level_support(neighborhood, level, scene.frames.size, groups, times, coords) for level in scene.levels]
+
+
+def _level_support(
+    neighborhood: Callable[..., Neighbors],
+    level: Level,
+    size: tuple[int, int],
+    groups: list,
+    times: Tensor,
+    coords: Tensor,
+) -> Neighbors:
+    features = points = indices = None
+    height, width = level.points.shape[2:4]
+    for frame, columns, uv in groups:
+        here = level.cut(frame, frame + 1)
+        cells = uv * torch.tensor([width / size[1], height / size[0]], dtype=uv.dtype, device=uv.device)
+        near = neighborhood(here, coords[:, None, columns], cells)
+        center = near.center[:, 0, :, None]
+        own = bilinear(here.features[:, 0], cells[:, 0])[:, :, None]
+        new = torch.cat([own, near.features[:, 0]], 2), torch.cat([center, near.points[:, 0]], 2)
+        mine = (times[:, columns] == frame)[..., None, None]  # (B, n, 1, 1)
+        features = _merge(features, columns, mine, new[0], coords)
+        points = _merge(points, columns, mine, new[1], coords)
+        if near.indices is not None:
+            rows = torch.cat([torch.full_like(near.indices[:, 0, :, :1], -1), near.indices[:, 0]], 2)
+            indices = _merge(indices, columns, mine[..., 0], rows, coords)
+    return Neighbors(features, points, coords, indices)
+
+
+def _merge(total: Tensor | None, columns: Tensor, mine: Tensor, new: Tensor, coords: Tensor) -> Tensor:
+    if total is None:
+        total = new.new_zeros(*coords.shape[:2], *new.shape[2:])
+    total[:, columns] = torch.where(mine, new, total[:, columns])
+    return total
+
+
+def bilinear(grid: Tensor, cells: Tensor) -> Tensor:
+    """Interpolate a grid (B, h, w, C) at cells (B, N, 2) = (column, row), clamped to the border; (B, N, C)."""
+    height, width, channels = grid.shape[1:]
+    x, y = cells[..., 0].clamp(0, width - 1), cells[..., 1].clamp(0, height - 1)
+    left, top = x.floor().clamp(max=max(width - 2, 0)), y.floor().clamp(max=max(height - 2, 0))
+    right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
+    a, b = (x - left).unsqueeze(-1), (y - top).unsqueeze(-1)
+    flat = grid.flatten(1, 2)
+
+    def at(row: Tensor, column: Tensor) -> Tensor:
+        index = (row * width + column).long().unsqueeze(-1)
+        return flat.gather(1, index.expand(-1, -1, channels))
+
+    upper = at(top, left) * (1 - a) + at(top, right) * a
+    lower = at(bottom, left) * (1 - a) + at(bottom, right) * a
+    return upper * (1 - b) + lower * b
