@@ -56,14 +56,15 @@ def random_path(rng: np.random.Generator, config: SimulationConfig) -> CameraPat
     height, width = config.size
     focal = rng.uniform(1.0, 1.5)  # in image sides; the distance below follows, so that framing stays alike
     pixels = focal * min(height, width)
-    distance = focal * rng.uniform(4.4, 5.4)
-    azimuth, elevation = np.repeat(rng.uniform(0, 2 * np.pi), 2), np.repeat(rng.uniform(0.3, 0.7), 2)
+    distance = focal * rng.uniform(4.0, 5.0)
+    azimuth = np.repeat(rng.uniform(0, 2 * np.pi), 2)
+    elevation = np.repeat(rng.uniform(0.12, 0.35) if config.sky else rng.uniform(0.3, 0.7), 2)
     shift, shake = np.zeros(3), np.zeros((6, 3, 3))
     sweep = np.deg2rad(rng.uniform(*config.arc)) * rng.choice([-1, 1])
     heading, travel = rng.uniform(0, 2 * np.pi), rng.uniform(1.5, 3.0)
     if config.camera == "arc":
         azimuth = azimuth + np.array([-0.5, 0.5]) * sweep
-        elevation = np.clip(elevation + np.array([-0.5, 0.5]) * rng.uniform(-0.3, 0.3), 0.25, 0.8)
+        elevation = np.clip(elevation + np.array([-0.5, 0.5]) * rng.uniform(-0.3, 0.3), 0.1, 0.8)
     if config.camera in ("linear", "handheld"):
         step = travel if config.camera == "linear" else 0.5 * config.handheld
         shift = step * np.array([np.cos(heading), np.sin(heading), rng.uniform(-0.3, 0.3)])

@@ -13,10 +13,10 @@ import mujoco
 import numpy as np
 
 from tapip3d_lite.simulate.scene import HIDDEN_GROUP, Scene
-from tapip3d_lite.simulate.textures import sky
 
 SUN_DISTANCE = 30.0
 SUN_RADIUS = 1.6  # metres at that distance: penumbras about as wide as on a lightly clouded day
+BACKDROP_GLOW = 0.8  # the backdrop is not lit by the sun: real horizons are not lit by one lamp
 _TONES = np.rint(255 * np.linspace(0, 1, 4096) ** (1 / 2.2)).astype(np.uint8)
 
 
@@ -43,12 +43,11 @@ def cast(
     return Hits(np.where(geom < 0, np.inf, distance), geom, normal.reshape(-1, 3))
 
 
-def pixel_rays(intrinsics: np.ndarray, extrinsics: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple:
-    """World-frame unit rays (len(v) * len(u), 3), row-major, and the z-depth (R,) of one unit along each."""
+def pixel_rays(intrinsics: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Camera-frame unit rays (len(v) * len(u), 3), row-major, through the pixels of columns u and rows v."""
     columns, rows = np.meshgrid((u - intrinsics[0, 2]) / intrinsics[0, 0], (v - intrinsics[1, 2]) / intrinsics[1, 1])
     rays = np.stack([columns.ravel(), rows.ravel(), np.ones(columns.size)], -1)
-    z = 1 / np.sqrt(np.einsum("rc,rc->r", rays, rays))
-    return (rays * z[:, None]) @ extrinsics[:3, :3], z
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
 def camera_center(extrinsics: np.ndarray) -> np.ndarray:
@@ -57,29 +56,40 @@ def camera_center(extrinsics: np.ndarray) -> np.ndarray:
 
 
 def render_depth(
-    scene: Scene, data: mujoco.MjData, intrinsics: np.ndarray, extrinsics: np.ndarray, size: tuple[int, int]
+    scene: Scene, data: mujoco.MjData, rays: np.ndarray, extrinsics: np.ndarray
 ) -> tuple[np.ndarray, Hits]:
-    """z-depth (H, W), 0 where the sky is, and the hits of all pixel centres, row-major."""
-    rays, z = pixel_rays(intrinsics, extrinsics, np.arange(size[1]), np.arange(size[0]))
-    hits = cast(scene.model, data, camera_center(extrinsics), rays)
-    return np.where(hits.geom < 0, 0, hits.distance * z).reshape(size), hits
+    """z-depths (R,) along camera-frame rays (R, 3), 0 where the sky is, and the hits."""
+    hits = cast(scene.model, data, camera_center(extrinsics), rays @ extrinsics[:3, :3])
+    return np.where(hits.geom < 0, 0, hits.distance * rays[:, 2]), hits
 
 
 def render_color(
-    scene: Scene, data: mujoco.MjData, intrinsics: np.ndarray, extrinsics: np.ndarray, size: tuple[int, int]
+    scene: Scene,
+    data: mujoco.MjData,
+    rays: np.ndarray,
+    extrinsics: np.ndarray,
+    size: tuple[int, int],
+    pixel: float,
 ) -> np.ndarray:
-    """Linear RGB (H, W, 3) float32."""
-    height, width = size
-    rays, _ = pixel_rays(intrinsics, extrinsics, np.arange(width + 1) - 0.5, np.arange(height + 1) - 0.5)
-    origin = camera_center(extrinsics)
+    """Linear RGB (H, W, 3) float32.
+
+    Args:
+        rays: ((H + 1) * (W + 1), 3) camera-frame unit rays through the pixels' corners.
+        extrinsics: (4, 4).
+        size: (H, W).
+        pixel: size of a pixel at distance 1.
+    """
+    shape = size[0] + 1, size[1] + 1
+    origin, rays = camera_center(extrinsics), rays @ extrinsics[:3, :3]
     hits = cast(scene.model, data, origin, rays)
     points = origin + rays * np.where(hits.geom < 0, 1, hits.distance)[:, None]
-    # The backdrop is seen from inside.
-    normal = hits.normal * -np.sign(np.einsum("rc,rc->r", hits.normal, rays))[:, None]
-    lit = _sunlit(scene, data, points, hits.geom, (height + 1, width + 1))
-    steepness = np.maximum(np.abs(np.einsum("rc,rc->r", normal, rays)), 0.2)
-    footprint = hits.distance / (intrinsics[0, 0] * steepness)
-    color = _shade(scene, data, points, normal, rays, hits.geom, lit, footprint).reshape(height + 1, width + 1, 3)
+    steepness = np.einsum("rc,rc->r", hits.normal, rays)
+    normal = hits.normal * -np.sign(steepness)[:, None]  # the backdrop is seen from inside
+    sunlight = np.maximum(normal @ scene.sun, 0).astype(np.float32)
+    sunlight[(hits.geom < 0) | scene.is_backdrop(hits.geom)] = 0
+    footprint = pixel * hits.distance / np.maximum(np.abs(steepness), 0.2)
+    sunlight *= _sunlit(scene, data, points, hits.geom, sunlight > 0, shape)
+    color = _shade(scene, data, points, normal, rays, hits.geom, sunlight, footprint).reshape(*shape, 3)
     rows = color[1:] + color[:-1]
     return (rows[:, 1:] + rows[:, :-1]) / 4
 
@@ -96,45 +106,47 @@ def _shade(
     normal: np.ndarray,
     rays: np.ndarray,
     geom: np.ndarray,
-    lit: np.ndarray,
+    sunlight: np.ndarray,
     footprint: np.ndarray,
 ) -> np.ndarray:
-    """Linear RGB (R, 3): texture times (ambient, brighter from above, + sun), and a faint highlight."""
+    """Linear RGB (R, 3): texture times (ambient, brighter from above, + sun), and a faint highlight on bodies."""
     color = np.empty((len(points), 3), np.float32)
-    order = np.argsort(geom, kind="stable")
+    order = np.argsort(geom.astype(np.int16), kind="stable")  # 16 bits: a radix sort
     starts = np.searchsorted(geom[order], np.arange(-1, scene.model.ngeom + 1))
     for index in range(-1, scene.model.ngeom):
-        chosen = order[starts[index + 1] : starts[index + 2]]
-        if not len(chosen):
+        at = order[starts[index + 1] : starts[index + 2]]
+        if not len(at):
             continue
         if index < 0:
-            color[chosen] = sky(rays[chosen], scene.clouds)
+            color[at] = scene.sky.color(rays[at])
             continue
-        local = (points[chosen] - data.geom_xpos[index]) @ data.geom_xmat[index].reshape(3, 3)
-        color[chosen] = scene.textures[index].color(local, footprint[chosen])
-    solid = (geom >= 0).astype(np.float32)
-    facing = np.maximum(normal @ scene.sun, 0).astype(np.float32)
-    halfway = scene.sun - rays
-    shine = np.einsum("rc,rc->r", normal, halfway) / np.sqrt(np.einsum("rc,rc->r", halfway, halfway))
-    shine = 0.18 * solid * (geom >= scene.first_body) * lit * np.maximum(shine, 0).astype(np.float32) ** 32
-    upward = (0.7 + 0.3 * normal[:, 2]).astype(np.float32)
-    light = upward[:, None] * scene.ambient.astype(np.float32)
-    light += (facing * lit)[:, None] * scene.sun_color.astype(np.float32)
-    if scene.first_body > 1:  # the backdrop glows by itself: real horizons are not lit by one lamp
-        light[geom == 1] = 0.8
-    light[geom < 0] = 1
-    return color * light + shine[:, None]
+        local = (points[at] - data.geom_xpos[index]) @ data.geom_xmat[index].reshape(3, 3)
+        paint = scene.textures[index].color(local)
+        if scene.is_backdrop(index):
+            color[at] = BACKDROP_GLOW * paint
+            continue
+        if index == 0:  # where a pixel covers more floor than the pattern's features, only its mean is left
+            fade = np.clip((footprint[at] - 0.15) / 0.4, 0, 1).astype(np.float32)
+            paint += fade[:, None] * (scene.floor_mean - paint)
+        upward = (0.7 + 0.3 * normal[at, 2:]).astype(np.float32)
+        paint *= upward * scene.ambient + sunlight[at, None] * scene.sun_color
+        if index:
+            halfway = scene.sun - rays[at]
+            shine = np.einsum("rc,rc->r", normal[at], halfway) / np.linalg.norm(halfway, axis=-1)
+            paint += (0.18 * (sunlight[at] > 0) * np.maximum(shine, 0) ** 32).astype(np.float32)[:, None]
+        color[at] = paint
+    return color
 
 
 def _sunlit(
-    scene: Scene, data: mujoco.MjData, points: np.ndarray, geom: np.ndarray, shape: tuple[int, int]
+    scene: Scene, data: mujoco.MjData, points: np.ndarray, geom: np.ndarray, asked: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
-    """The visible share of the sun (R,) float32 at points on a grid of `shape`."""
+    """The visible share of the sun (R,) float32 at points on a grid of `shape`; 1 without a look where not `asked`."""
     rows, columns = np.indices(shape).reshape(2, -1)
     interleaved = (rows % 3) * 3 + columns % 3
     lit = np.ones(len(points), np.float32)
     for index, position in enumerate(_sun_points(scene.sun)):
-        chosen = np.flatnonzero((interleaved == index) & (geom >= 0))
+        chosen = np.flatnonzero((interleaved == index) & asked)
         towards = points[chosen] - position
         distance = np.sqrt(np.einsum("rc,rc->r", towards, towards))
         hits = cast(scene.model, data, position, towards / distance[:, None], shadow=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from tapip3d_lite.simulate.config import PRIMITIVES, SimulationConfig
 from tapip3d_lite.simulate.meshes import MESHES
-from tapip3d_lite.simulate.textures import Texture, random_texture
+from tapip3d_lite.simulate.textures import Sky, Texture, random_sky, random_texture
 
 DOME_RADIUS = 11.0
 HIDDEN_GROUP = 1  # the backdrop's geom group: it is seen by the camera, but throws no shadow
@@ -38,7 +38,8 @@ class Scene:
         model: geoms in the order floor, (backdrop,) bodies.
         bodies: in the order of the model's last geoms.
         textures: one per geom.
-        clouds: (12, 4) waves of the sky.
+        sky: what lies where no geom is.
+        floor_mean: (3,) mean colour of the floor, which its far pattern fades to.
         sun: (3,) unit vector towards the sun.
         sun_color, ambient: (3,) linear RGB.
     """
@@ -46,7 +47,8 @@ class Scene:
     model: mujoco.MjModel
     bodies: tuple[Body, ...]
     textures: tuple[Texture, ...]
-    clouds: np.ndarray
+    sky: Sky
+    floor_mean: np.ndarray
     sun: np.ndarray
     sun_color: np.ndarray
     ambient: np.ndarray
@@ -56,10 +58,14 @@ class Scene:
         """The geom index of the first body."""
         return self.model.ngeom - len(self.bodies)
 
+    def is_backdrop(self, geom: int | np.ndarray) -> bool | np.ndarray:
+        """Whether a geom index is the backdrop's, which is seen from inside."""
+        return (self.first_body == 2) & (geom == 1)
+
 
 def random_scene(rng: np.random.Generator, config: SimulationConfig, azimuth: float) -> Scene:
     """Draw a scene; `azimuth` (radians) is the camera's mean direction, where an occluder has to stand."""
-    floor, behind = random_texture(rng, scale=2.0), random_texture(rng, scale=4.0)
+    floor, behind = random_texture(rng, scale=2.0, flat=True), random_texture(rng, scale=5.0)
     shared = random_texture(rng) if config.same_texture else None
     resting = int(rng.integers(config.resting[0], config.resting[1] + 1))
     moving = int(rng.integers(config.moving[0], config.moving[1] + 1))
@@ -74,10 +80,11 @@ def random_scene(rng: np.random.Generator, config: SimulationConfig, azimuth: fl
         model=_compile(rng, config, bodies),
         bodies=tuple(bodies),
         textures=(*environment, *(body.texture for body in bodies)),
-        clouds=np.concatenate([rng.normal(size=(12, 3)) * 2, rng.uniform(0, 2 * np.pi, (12, 1))], -1),
+        sky=random_sky(rng),
+        floor_mean=floor.color(rng.uniform(-5, 5, (4096, 3)) * (1, 1, 0)).mean(0),
         sun=sun,
-        sun_color=rng.uniform(0.75, 0.95) * np.array([1 + warmth, 1.0, 1 - warmth]),
-        ambient=rng.uniform(0.32, 0.45) * np.array([1 - warmth / 2, 1.0, 1 + warmth / 2]),
+        sun_color=np.float32(rng.uniform(0.75, 0.95) * np.array([1 + warmth, 1.0, 1 - warmth])),
+        ambient=np.float32(rng.uniform(0.32, 0.45) * np.array([1 - warmth / 2, 1.0, 1 + warmth / 2])),
     )
 
 
@@ -121,7 +128,7 @@ def _occluder(rng: np.random.Generator, azimuth: float) -> Body:
 def _compile(rng: np.random.Generator, config: SimulationConfig, bodies: list[Body]) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    extent = 40 if config.sky else 0  # 0 is endless; under the sky the floor must end before depths become absurd
+    extent = 18 if config.sky else 0  # 0 is endless; under the sky the floor must end before depths become absurd
     floor = dict(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[extent, extent, 1])
     spec.worldbody.add_geom(**floor, friction=[0.7, 0.01, 0.003])
     if not config.sky:

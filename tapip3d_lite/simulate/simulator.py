@@ -11,7 +11,7 @@ from tapip3d_lite.clip import Clip
 from tapip3d_lite.simulate.cameras import random_path
 from tapip3d_lite.simulate.config import SimulationConfig
 from tapip3d_lite.simulate.physics import UnstableSceneError, geom_poses, roll_out
-from tapip3d_lite.simulate.render import Hits, render_color, render_depth, to_bytes
+from tapip3d_lite.simulate.render import Hits, pixel_rays, render_color, render_depth, to_bytes
 from tapip3d_lite.simulate.scene import Scene, random_scene
 from tapip3d_lite.simulate.tracks import make_tracks, moving_geoms, sample_pixels
 
@@ -106,10 +106,12 @@ def _measure(
     """z-depths (T, H, W) float64 and the pixel centres' hits of all frames."""
     data = mujoco.MjData(scene.model)
     depths, hits = np.empty((len(states), *config.size)), []
+    rays = pixel_rays(intrinsics, np.arange(config.size[1]), np.arange(config.size[0]))
     for t, state in enumerate(states):
         data.qpos[:] = state
         mujoco.mj_kinematics(scene.model, data)
-        depths[t], hit = render_depth(scene, data, intrinsics, extrinsics[t], config.size)
+        depth, hit = render_depth(scene, data, rays, extrinsics[t])
+        depths[t] = depth.reshape(config.size)
         hits.append(hit)
     return depths, hits
 
@@ -120,12 +122,13 @@ def _film(
     """The video (T, H, W, 3) uint8; states (T, S, nq) and extrinsics (T, S, 4, 4) are averaged over S in light."""
     data = mujoco.MjData(scene.model)
     video = np.empty((config.frames, *config.size, 3), np.uint8)
+    rays = pixel_rays(intrinsics, np.arange(config.size[1] + 1) - 0.5, np.arange(config.size[0] + 1) - 0.5)
     for t in range(config.frames):
         light = np.zeros((*config.size, 3), np.float32)
         for state, pose in zip(states[t], extrinsics[t], strict=True):
             data.qpos[:] = state
             mujoco.mj_kinematics(scene.model, data)
-            light += render_color(scene, data, intrinsics, pose, config.size)
+            light += render_color(scene, data, rays, pose, config.size, 1 / intrinsics[0, 0])
         video[t] = to_bytes(light / states.shape[1])
     return video
 

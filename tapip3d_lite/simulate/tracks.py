@@ -117,8 +117,7 @@ def point_visibility(
     data = mujoco.MjData(scene.model)
     uv, z = project(xyz, intrinsics, extrinsics)
     visible = (z > 0) & ((uv >= -0.5) & (uv < np.array(size[::-1]) - 0.5)).all(-1)
-    inward = scene.first_body == 2  # then geom 1 is the backdrop, seen from inside
-    sign = np.where((geom == 1) & inward, -1, 1)
+    sign = np.where(scene.is_backdrop(geom), -1, 1)
     for t, state in enumerate(states):
         data.qpos[:] = state
         mujoco.mj_kinematics(scene.model, data)
