@@ -29,6 +29,11 @@ class Level:
     valid: Tensor
     extra: Any = None
 
+    def cells(self, uv: Tensor, size: tuple[int, int]) -> Tensor:
+        """Pixels (..., 2) of images (H, W) in units of cells, (u w / W, v h / H): the features' convention."""
+        height, width = self.points.shape[2:4]
+        return torch.stack([uv[..., 0] * width / size[1], uv[..., 1] * height / size[0]], -1)
+
     def cut(self, start: int, stop: int) -> Level:
         """Frames [start, stop)."""
         return replace(

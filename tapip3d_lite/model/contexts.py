@@ -7,6 +7,8 @@ then each bag is pooled by a learned token, and the two results are added.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -109,7 +111,7 @@ class N2N(Context):
 
     def prepare(self, index: int, level: Level) -> Level:
         """Embed each cell once, not once for every neighbourhood that contains it."""
-        return Level(self.embed.features(level.features), level.points, level.valid, level.extra)
+        return replace(level, features=self.embed.features(level.features))
 
     def describe(self, index: int, support: Neighbors) -> Tensor:
         """Support tokens (B, N, 1 + K, D); with `use_features` the query's embedded feature follows as one more row."""

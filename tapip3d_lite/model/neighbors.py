@@ -8,12 +8,12 @@ A neighbourhood is any callable with the signature of `KNearest.forward`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.model.cloud import Level
+from tapip3d_lite.model.cloud import Level, Normalizer
 from tapip3d_lite.model.config import TrackerConfig
 
 _BUDGET = 2**24  # distances that exist at once: 64 MiB in float32
@@ -39,6 +39,15 @@ class Neighbors:
     def offsets(self) -> Tensor:
         """(..., N, K, 3), cell minus centre."""
         return self.points - self.center.unsqueeze(-2)
+
+    def pick(self, columns: Tensor) -> Neighbors:
+        """Some of the N points of (B, N, ...) neighbourhoods."""
+        indices = None if self.indices is None else self.indices[:, columns]
+        return Neighbors(self.features[:, columns], self.points[:, columns], self.center[:, columns], indices)
+
+    def normalized(self, norm: Normalizer) -> Neighbors:
+        """The same neighbourhoods in normalised coordinates."""
+        return replace(self, points=norm.normalize(self.points), center=norm.normalize(self.center))
 
 
 class KNearest(nn.Module):

@@ -6,16 +6,13 @@ Paper: section 3.3. It is collected once a call, in un-normalised coordinates; o
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from tapip3d_lite.model.cloud import Level
 from tapip3d_lite.model.neighbors import Neighbors
-
-if TYPE_CHECKING:
-    from tapip3d_lite.model.tracker import Scene
+from tapip3d_lite.model.scene import Scene
 
 
 def query_support(
@@ -50,10 +47,9 @@ def _level_support(
     coords: Tensor,
 ) -> Neighbors:
     features = points = indices = None
-    height, width = level.points.shape[2:4]
     for frame, columns, uv in groups:
         here = level.cut(frame, frame + 1)
-        cells = uv * torch.tensor([width / size[1], height / size[0]], dtype=uv.dtype, device=uv.device)
+        cells = level.cells(uv, size)
         near = neighborhood(here, coords[:, None, columns], cells)
         center = near.center[:, 0, :, None]
         own = bilinear(here.features[:, 0], cells[:, 0])[:, :, None]

@@ -6,7 +6,7 @@ Paper: section 3 and figure 2. `Tracker.steps` is the whole method; `forward` an
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,74 +14,21 @@ from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.model import inference
-from tapip3d_lite.model.cloud import Level, Normalizer, feature_cloud
+from tapip3d_lite.model.cloud import Normalizer, feature_cloud
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.encoder import Encoder
 from tapip3d_lite.model.fourier import time_embedding
 from tapip3d_lite.model.frames import Frames
 from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.parts import make_module, make_space
+from tapip3d_lite.model.scene import Scene, Step, Window, to_world
 from tapip3d_lite.model.support import query_support
 from tapip3d_lite.model.tokens import token_width, trajectory_tokens
 from tapip3d_lite.model.windows import State, window_ends
 
 _CHUNK = 2**25  # floats of context tokens that exist at once without gradient: 128 MiB
 
-__all__ = ["Scene", "Step", "Tracker", "TrackerConfig"]
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What is known about some frames before any query is asked.
-
-    Attributes:
-        frames: T posed RGB-D frames.
-        points: (B, T, H, W, 3), in the trajectories' space.
-        valid: (B, T, H, W) bool: depth known and inside the region of interest.
-        levels: the feature cloud.
-        space: the trajectories' space.
-    """
-
-    frames: Frames
-    points: Tensor
-    valid: Tensor
-    levels: list[Level]
-    space: Any
-
-    def cut(self, start: int, stop: int) -> Scene:
-        """Frames [start, stop)."""
-        levels = [level.cut(start, stop) for level in self.levels]
-        return Scene(
-            self.frames.cut(start, stop), self.points[:, start:stop], self.valid[:, start:stop], levels, self.space
-        )
-
-
-@dataclass(frozen=True)
-class Step:
-    """The state of one window after one update.
-
-    Attributes:
-        start: the window's first frame.
-        iteration: 0..M-1.
-        coords: (B, S, n, 3) in the trajectories' space; carries the gradient of this iteration only.
-        logits: (B, S, n) visibility.
-        columns: (n,) which of the N tracks these are.
-        active: (B, n) bool, which of them belong to this window.
-        scene: the window's S frames.
-    """
-
-    start: int
-    iteration: int
-    coords: Tensor
-    logits: Tensor
-    columns: Tensor
-    active: Tensor
-    scene: Scene
-
-    @property
-    def xyz(self) -> Tensor:
-        """(B, S, n, 3) in the world."""
-        return to_world(self.coords, self.scene.frames, self.scene.space)
+__all__ = ["Tracker", "TrackerConfig"]
 
 
 class Tracker(nn.Module):
@@ -154,11 +101,14 @@ class Tracker(nn.Module):
             if not len(columns):
                 continue
             coords, logits = state.initial(start, stop, columns)
-            window, chosen = scene.cut(start, stop), [_select(level, columns) for level in support]
-            updates = self.refine(window, chosen, coords, logits, mask, iterations)
-            for iteration, (coords, logits) in enumerate(updates):
-                yield Step(start, iteration, coords, logits, columns, mask, window)
-            state.write(start, stop, columns, mask, coords.detach(), logits.detach())
+            cut = scene.cut(start, stop)
+            window = self.window(cut, [near.pick(columns) for near in support], mask)
+            coords = window.norm.normalize(coords)
+            for iteration in range(iterations):
+                # Nothing flows back from one iteration into the one before.
+                coords, logits = self.update(window, coords.detach(), logits.detach())
+                yield Step(start, iteration, window.norm.restore(coords), logits, columns, mask, cut)
+            state.write(start, stop, columns, mask, window.norm.restore(coords.detach()), logits.detach())
 
     def scene(self, frames: Frames, features: Tensor, space: Any, depth_roi: tuple[float, float] | None) -> Scene:
         """Lift frames to a feature cloud; frames and features are padded to whole half windows."""
@@ -189,69 +139,60 @@ class Tracker(nn.Module):
         with torch.autocast(coords.device.type, enabled=False):
             return query_support(self.neighborhood, scene, queries[..., 0].long(), coords)
 
-    def refine(
-        self,
-        window: Scene,
-        support: list[Neighbors],
-        coords: Tensor,
-        logits: Tensor,
-        active: Tensor,
-        iterations: int,
-    ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Update the trajectories of one window M times (equation 1).
+    def window(self, scene: Scene, support: list[Neighbors], active: Tensor) -> Window:
+        """Normalise one window and let the context prepare it.
 
         Args:
-            window: S frames.
+            scene: S frames.
             support: L times (B, n, 1 + K, ...), from `support`.
-            coords: (B, S, n, 3) initial trajectories in the window's space.
-            logits: (B, S, n) initial visibility.
             active: (B, n) bool, tracks that exist.
-            iterations: M.
-
-        Yields:
-            coords and logits after each update; nothing flows back from one iteration into the one before.
         """
-        norm = Normalizer.fit(window.points, window.valid, self.config.norm_mode, self.config.norm_scale)
-        levels = [
-            self.context.prepare(i, Level(x.features, norm.normalize(x.points), x.valid))
-            for i, x in enumerate(window.levels)
-        ]
-        kept = [self.context.describe(i, _normalize(x, norm)) for i, x in enumerate(support)]
-        mask = None if bool(active.all()) else active
-        x = norm.normalize(coords)
-        for _ in range(iterations):
-            x, logits = x.detach(), logits.detach()
-            with torch.autocast(x.device.type, enabled=False):
-                uv = window.space.to_pixels(norm.restore(x), window.frames.intrinsics, window.frames.extrinsics)
-            evidence = self.evidence(levels, kept, x, uv)
-            pixels = uv if self.config.use_uv else None
-            tokens = trajectory_tokens(x, logits, evidence, pixels, window.frames.size, self.time)
-            delta = self.updater(tokens, mask).float()
-            x, logits = x + delta[..., :3], logits + delta[..., 3]
-            yield norm.restore(x), logits
+        norm = Normalizer.fit(scene.points, scene.valid, self.config.norm_mode, self.config.norm_scale)
+        cloud = [replace(level, points=norm.normalize(level.points)) for level in scene.levels]
+        levels = [self.context.prepare(i, level) for i, level in enumerate(cloud)]
+        kept = [self.context.describe(i, near.normalized(norm)) for i, near in enumerate(support)]
+        return Window(scene, norm, levels, kept, None if bool(active.all()) else active)
 
-    def evidence(self, levels: list[Level], kept: list[Tensor], coords: Tensor, uv: Tensor) -> Tensor:
+    def update(self, window: Window, coords: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
+        """Update the trajectories of one window once (equation 1).
+
+        Args:
+            window: from `window`.
+            coords: (B, S, n, 3) normalised.
+            logits: (B, S, n) visibility.
+
+        Returns:
+            The new coords and logits.
+        """
+        frames = window.scene.frames
+        with torch.autocast(coords.device.type, enabled=False):
+            uv = window.scene.space.to_pixels(window.norm.restore(coords), frames.intrinsics, frames.extrinsics)
+        evidence = self.evidence(window, coords, uv)
+        pixels = uv if self.config.use_uv else None
+        tokens = trajectory_tokens(coords, logits, evidence, pixels, frames.size, self.time)
+        delta = self.updater(tokens, window.active).float()
+        return coords + delta[..., :3], logits + delta[..., 3]
+
+    def evidence(self, window: Window, coords: Tensor, uv: Tensor) -> Tensor:
         """Collect each estimate's neighbourhood and compare it with the query's, at all levels.
 
         Args:
-            levels: L prepared levels with normalised points.
-            kept: L times (B, n, ...), from the context's `describe`.
+            window: from `window`.
             coords: (B, S, n, 3) normalised.
             uv: (B, S, n, 2) pixels.
 
         Returns:
             (B, S, n, L * width).
         """
-        floats = coords.shape[0] * coords.shape[1] * self.config.neighbors * self.config.token_dim * 4
-        step = coords.shape[2] if torch.is_grad_enabled() else max(1, _CHUNK // floats)
+        count, config = coords.shape[2], self.config
+        floats = coords.shape[0] * coords.shape[1] * config.neighbors * config.token_dim * 4
+        step = count if torch.is_grad_enabled() else max(1, _CHUNK // floats)
         chunks = []
-        for part in torch.arange(coords.shape[2], device=coords.device).split(step):
-            rows = slice(int(part[0]), int(part[-1]) + 1)
+        for rows in (slice(i, i + step) for i in range(0, count, step)):
             outputs = []
-            for i, (level, keep) in enumerate(zip(levels, kept, strict=True)):
-                cells = uv[:, :, rows] * cell_scale(level, self.config.image_size).to(uv.device)
-                near = self.neighborhood(level, coords[:, :, rows], cells)
-                outputs.append(self.context(i, keep[:, rows], near))
+            for i, (level, kept) in enumerate(zip(window.levels, window.kept, strict=True)):
+                near = self.neighborhood(level, coords[:, :, rows], level.cells(uv[:, :, rows], config.image_size))
+                outputs.append(self.context(i, kept[:, rows], near))
             chunks.append(torch.cat(outputs, -1))
         return torch.cat(chunks, 2)
 
@@ -270,24 +211,3 @@ class Tracker(nn.Module):
             )
         if iterations < 1:
             raise ValueError(f"iterations: expected at least 1, got {iterations}")
-
-
-def to_world(coords: Tensor, frames: Frames, space: Any) -> Tensor:
-    """Trajectories (B, T, N, 3) of a space in world coordinates."""
-    with torch.autocast(coords.device.type, enabled=False):
-        return space.to_world(coords, frames.intrinsics, frames.extrinsics, frames.depths)
-
-
-def cell_scale(level: Level, size: tuple[int, int]) -> Tensor:
-    """(2,) cells per pixel, (w / W, h / H); the features' convention, without a half-cell shift."""
-    height, width = level.points.shape[2:4]
-    return torch.tensor([width / size[1], height / size[0]], dtype=torch.float32)
-
-
-def _select(support: Neighbors, columns: Tensor) -> Neighbors:
-    parts = support.features, support.points, support.center, support.indices
-    return Neighbors(*(None if x is None else x[:, columns] for x in parts))
-
-
-def _normalize(support: Neighbors, norm: Normalizer) -> Neighbors:
-    return Neighbors(support.features, norm.normalize(support.points), norm.normalize(support.center), support.indices)
