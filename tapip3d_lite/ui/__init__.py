@@ -1,0 +1,1 @@
+"""What a reader sees: figures (pure functions), widgets (thin shells over figures), exercises (checkers)."""

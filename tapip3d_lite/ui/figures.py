@@ -1,0 +1,79 @@
+"""All figures of the kit: pure functions of clips and tracks that return figure objects, and what shows or saves them.
+
+Flat figures are matplotlib `Figure`s made without pyplot, so nothing stays open behind the reader's back. 3D figures
+are plotly with a time slider; `show_3d` pairs each with a matplotlib twin for viewers that run no JavaScript.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import plotly.graph_objects as go
+from matplotlib.figure import Figure
+
+from tapip3d_lite.files import atomic_path
+from tapip3d_lite.ui.figures2d import (
+    contact_sheet,
+    depth_map,
+    frame_with_tracks,
+    overview,
+    scores_bar,
+    track_colors,
+    tracks_over_time,
+)
+from tapip3d_lite.ui.figures3d import tracks_3d, tracks_3d_static
+
+__all__ = [
+    "contact_sheet",
+    "depth_map",
+    "frame_with_tracks",
+    "overview",
+    "save_html",
+    "save_png",
+    "scores_bar",
+    "show_3d",
+    "track_colors",
+    "tracks_3d",
+    "tracks_3d_static",
+    "tracks_over_time",
+]
+
+
+class show_3d:
+    """A 3D figure for a notebook cell: interactive where plotly runs, its PNG twin everywhere else.
+
+    Args:
+        figure: the plotly figure.
+        twin: the matplotlib figure with the same content, for static viewers such as a repository's web page.
+    """
+
+    def __init__(self, figure: go.Figure, twin: Figure) -> None:
+        self.figure, self.twin = figure, twin
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, object]:
+        return {
+            "application/vnd.plotly.v1+json": json.loads(self.figure.to_json()),
+            "image/png": png_bytes(self.twin),
+            "text/plain": f"3D figure with {len(self.figure.frames)} frames; its static twin is the PNG",
+        }
+
+
+def png_bytes(figure: Figure, dpi: int = 90) -> bytes:
+    """The figure as PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def save_png(figure: Figure, path: str | Path, dpi: int = 110) -> None:
+    """Write a matplotlib figure as PNG, atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(png_bytes(figure, dpi))
+
+
+def save_html(figure: go.Figure, path: str | Path) -> None:
+    """Write a plotly figure as one page that needs no network (plotly.js is inside, about 5 MB), atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(figure.to_html(include_plotlyjs=True, auto_play=False, validate=False), encoding="utf-8")

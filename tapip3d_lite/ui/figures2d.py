@@ -1,0 +1,174 @@
+"""Flat figures: frames with tracks, depth, contact sheets, coordinates over time, score bars."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.geometry import project
+
+INK = "#30343b"
+
+
+def track_colors(clip: Clip, tracks: Tracks) -> np.ndarray:
+    """One RGB colour (N, 3) in [0, 1] for each track, by where its query lies in the image; alike in all figures."""
+    t = tracks.queries[:, 0].astype(int)
+    uv, _ = project(tracks.queries[:, None, 1:], clip.intrinsics[t], clip.extrinsics[t])
+    height, width = clip.size
+    place = (uv[:, 0, 0] / width + uv[:, 0, 1] / height) / 2
+    return matplotlib.colormaps["turbo"](np.clip(place, 0.03, 0.97))[:, :3]
+
+
+def frame_with_tracks(
+    clip: Clip, tracks: Tracks, frame: int, tail: int = 8, truth: Tracks | None = None, ax: Axes | None = None
+) -> Figure:
+    """A video frame with the tracked points: filled where visible, hollow where occluded, tails over past frames.
+
+    Args:
+        clip: the clip.
+        tracks: what to draw, world frame.
+        frame: frame index.
+        tail: how many past frames the tails cover.
+        truth: true tracks of the same queries; a white line then joins each estimate with the truth.
+        ax: axes to draw into, else a new figure.
+    """
+    ax = ax or _axes(clip)
+    _image(ax, clip.video[frame], f"{clip.name} · frame {frame}")
+    start = max(0, frame - tail)
+    span = slice(start, frame + 1)
+    uv, z = project(tracks.xyz[span], clip.intrinsics[span], clip.extrinsics[span])
+    uv = np.where((z > 0)[..., None], uv, np.nan)
+    colors = track_colors(clip, tracks)
+    for n in range(uv.shape[1]):
+        ax.plot(uv[:, n, 0], uv[:, n, 1], color=colors[n], lw=1.1, alpha=0.85)
+    seen = tracks.visible[frame]
+    now = uv[-1]
+    ax.scatter(*now[~seen].T, s=11, facecolors="none", edgecolors=colors[~seen], linewidths=0.8)
+    ax.scatter(*now[seen].T, s=11, c=colors[seen], edgecolors="white", linewidths=0.3)
+    if truth is not None:
+        true_uv, _ = project(truth.xyz[frame], clip.intrinsics[frame], clip.extrinsics[frame])
+        ax.plot(*np.stack([now, true_uv], 1).transpose(2, 1, 0), color="white", lw=0.8)
+    return ax.figure
+
+
+def depth_map(clip: Clip, frame: int, ax: Axes | None = None) -> Figure:
+    """Depth of one frame with a colour bar in scene units; pixels without depth are grey."""
+    ax = ax or _axes(clip, extra=0.9)
+    depth = clip.depths[frame]
+    shown = np.ma.masked_equal(depth, 0)
+    cmap = matplotlib.colormaps["viridis_r"].with_extremes(bad="#b8b8b8")
+    high = np.quantile(depth[depth > 0], 0.99) if depth.any() else 1.0
+    image = ax.imshow(shown, cmap=cmap, vmax=high)
+    _frame(ax, f"{clip.name} · depth, frame {frame}")
+    bar = ax.figure.colorbar(image, ax=ax, fraction=0.046, pad=0.03, extend="max")
+    bar.set_label("z-depth (scene units)", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+    return ax.figure
+
+
+def contact_sheet(clips: Clip | Sequence[Clip], frames: int = 6, width: float = 1.35) -> Figure:
+    """Frames spread over time, one row a clip."""
+    clips = [clips] if isinstance(clips, Clip) else list(clips)
+    height, wide = clips[0].size
+    figure = _figure(frames * width, len(clips) * width * height / wide + 0.25)
+    for row, clip in enumerate(clips):
+        for column, t in enumerate(np.linspace(0, len(clip) - 1, frames).astype(int)):
+            ax = figure.add_subplot(len(clips), frames, row * frames + column + 1)
+            title = f"t = {t}" if row == 0 else ""
+            _image(ax, clip.video[t], title)
+            if column == 0:
+                ax.set_ylabel(clip.name, fontsize=8, color=INK)
+    return figure
+
+
+def tracks_over_time(
+    curves: Mapping[str, np.ndarray], labels: Sequence[str] = ("x", "y", "z"), unit: str = "scene units"
+) -> Figure:
+    """Coordinates of one point over time, one panel a coordinate, one curve an entry.
+
+    Args:
+        curves: name to (T, C); NaN leaves gaps.
+        labels: names of the C coordinates.
+        unit: for the vertical axes.
+    """
+    figure = _figure(3.0 * len(labels), 2.3)
+    for i, label in enumerate(labels):
+        ax = figure.add_subplot(1, len(labels), i + 1)
+        for name, curve in curves.items():
+            ax.plot(curve[:, i], label=name, lw=1.6)
+        _plot(ax, f"{label} ({unit})", "frame")
+    figure.axes[0].legend(fontsize=7, frameon=False)
+    return figure
+
+
+def scores_bar(scores: Mapping[str, Mapping[str, float]], metrics: Sequence[str] = ("AJ3D", "APD3D", "OA")) -> Figure:
+    """Scores of several trackers side by side, with the numbers written on the bars.
+
+    Args:
+        scores: tracker name to the dictionary that `evaluate` returns.
+        metrics: which entries to show.
+    """
+    figure = _figure(1.6 * len(metrics) + 1.5, 2.4)
+    ax = figure.add_subplot()
+    step = 0.8 / len(scores)
+    for i, (name, values) in enumerate(scores.items()):
+        at = np.arange(len(metrics)) + (i - (len(scores) - 1) / 2) * step
+        bars = ax.bar(at, [values[m] for m in metrics], step * 0.92, label=name, color=f"C{i}")
+        ax.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
+    ax.set_xticks(range(len(metrics)), metrics)
+    ax.set_ylim(0, 1.1)
+    _plot(ax, "score", "")
+    ax.legend(fontsize=7, frameon=False, ncols=len(scores), loc="upper center", bbox_to_anchor=(0.5, 1.18))
+    return figure
+
+
+def overview(clip: Clip, tracks: Tracks, columns: int = 4) -> Figure:
+    """The picture of a result: frames with tracks above, their depth below."""
+    height, width = clip.size
+    figure = _figure(2.6 * columns, 2 * 2.6 * height / width + 0.4)
+    for i, t in enumerate(np.linspace(0, len(clip) - 1, columns).astype(int)):
+        frame_with_tracks(clip, tracks, t, ax=figure.add_subplot(2, columns, i + 1))
+        ax = figure.add_subplot(2, columns, columns + i + 1)
+        depth = np.ma.masked_equal(clip.depths[t], 0)
+        ax.imshow(depth, cmap="viridis_r", vmax=np.quantile(clip.depths[clip.depths > 0], 0.99))
+        _frame(ax, "depth" if i == 0 else "")
+    return figure
+
+
+def _figure(width: float, height: float) -> Figure:
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _axes(clip: Clip, side: float = 3.4, extra: float = 0.0) -> Axes:
+    height, width = clip.size
+    return _figure(side + extra, side * height / width + 0.25).add_subplot()
+
+
+def _image(ax: Axes, image: np.ndarray, title: str) -> None:
+    ax.imshow(image)
+    height, width = image.shape[:2]
+    ax.set_xlim(-0.5, width - 0.5)
+    ax.set_ylim(height - 0.5, -0.5)
+    ax.set_autoscale_on(False)
+    _frame(ax, title)
+
+
+def _frame(ax: Axes, title: str) -> None:
+    ax.set_xticks([])
+    ax.set_yticks([])
+    ax.set_title(title, fontsize=8, color=INK)
+    for side in ax.spines.values():
+        side.set_visible(False)
+
+
+def _plot(ax: Axes, vertical: str, horizontal: str) -> None:
+    ax.set_ylabel(vertical, fontsize=8)
+    ax.set_xlabel(horizontal, fontsize=8)
+    ax.tick_params(labelsize=7)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.grid(alpha=0.25, lw=0.5)

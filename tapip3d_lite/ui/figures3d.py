@@ -1,0 +1,203 @@
+"""The 3D scene: a point cloud with tracks and a time slider (plotly), and its flat twin (matplotlib)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.geometry import invert, transform, unproject
+from tapip3d_lite.ui.figures2d import track_colors
+
+_LEVELS = 6  # colour levels per channel: a code into 216 colours costs a byte a point, an RGB string twenty
+
+
+def tracks_3d(
+    clip: Clip, tracks: Tracks, points: int = 1500, max_tracks: int = 120, tail: int = 8, title: str | None = None
+) -> go.Figure:
+    """Point cloud and tracks in world coordinates with a time slider and a play button.
+
+    The view opens where the first camera stands and stays as the reader turns it while the slider moves.
+
+    Args:
+        clip: the clip.
+        tracks: what to draw, world frame.
+        points: cloud points per frame (the file grows by about 17 bytes a point and frame).
+        max_tracks: at most this many tracks are drawn, evenly picked.
+        tail: past frames that the tails cover.
+        title: above the scene.
+    """
+    near = _near(clip)
+    tracks = _drawn(clip, tracks, near, max_tracks)
+    colors = track_colors(clip, tracks)
+    scale = _color_scale(colors)
+    frames = [
+        go.Frame(
+            name=str(t), data=[_cloud(clip, t, points, near), _tails(tracks, t, tail, scale), _heads(tracks, t, colors)]
+        )
+        for t in range(len(clip))
+    ]
+    figure = go.Figure(data=frames[0].data, frames=frames)
+    figure.update_layout(
+        title=title or clip.name,
+        scene=_scene(clip, tracks, near),
+        margin={"l": 0, "r": 0, "t": 36, "b": 0},
+        height=520,
+        showlegend=False,
+        uirevision="keep",  # the reader's view survives every redraw
+        updatemenus=[_play_button()],
+        sliders=[_slider(len(clip))],
+    )
+    return figure
+
+
+def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = None, points: int = 2500) -> Figure:
+    """The matplotlib twin of `tracks_3d`: the scene at a few instants, from above the first camera.
+
+    Args:
+        clip: the clip.
+        tracks: what to draw, world frame.
+        frames: frame indices; default first, middle and last.
+        points: cloud points per panel.
+    """
+    frames = [0, len(clip) // 2, len(clip) - 1] if frames is None else list(frames)
+    near = _near(clip)
+    tracks = _drawn(clip, tracks, near, 120)
+    colors = track_colors(clip, tracks)
+    figure = Figure(figsize=(3.4 * len(frames), 2.9), layout="constrained")
+    upright = clip.extrinsics[0]
+    limits = _limits(transform(np.concatenate([_cloud_points(clip, t, 800, near)[0] for t in frames]), upright))
+    for i, t in enumerate(frames):
+        ax = figure.add_subplot(1, len(frames), i + 1, projection="3d", computed_zorder=False)
+        xyz, rgb = _cloud_points(clip, t, points, near)
+        x, y, z = transform(xyz, upright).T
+        ax.scatter(x, z, -y, c=rgb / 255, s=2.2, depthshade=False, linewidths=0)
+        path = transform(tracks.xyz[max(0, t - 12) : t + 1], upright)
+        for n in range(path.shape[1]):
+            ax.plot(path[:, n, 0], path[:, n, 2], -path[:, n, 1], color=colors[n], lw=1)
+        ax.set_xlim(limits[0])
+        ax.set_ylim(limits[2])
+        ax.set_zlim(-limits[1][1], -limits[1][0])
+        ax.set_box_aspect([np.ptp(limits[k]) for k in (0, 2, 1)], zoom=1.3)
+        ax.view_init(elev=22, azim=-75)
+        ax.set_title(f"t = {t}", fontsize=8)
+        ax.set(xticklabels=[], yticklabels=[], zticklabels=[])
+    return figure
+
+
+def _near(clip: Clip) -> float:
+    """Depth beyond which nothing is drawn: a far backdrop would shrink all that moves to a speck."""
+    return 1.6 * float(np.median(clip.depths[clip.depths > 0]))
+
+
+def _drawn(clip: Clip, tracks: Tracks, near: float, most: int) -> Tracks:
+    """At most `most` tracks, evenly picked from those whose query lies within the drawn depth."""
+    t = tracks.queries[:, 0].astype(int)
+    z = transform(tracks.queries[:, None, 1:], clip.extrinsics[t])[:, 0, 2]
+    inside = np.flatnonzero(z <= near) if (z <= near).any() else np.arange(len(z))
+    return tracks.select(inside[np.unique(np.linspace(0, len(inside) - 1, most).astype(int))])
+
+
+def _cloud_points(clip: Clip, frame: int, points: int, near: float) -> tuple[np.ndarray, np.ndarray]:
+    v, u = np.nonzero((clip.depths[frame] > 0) & (clip.depths[frame] <= near))
+    pick = np.random.default_rng(frame).permutation(len(v))[:points]
+    v, u = v[pick], u[pick]
+    uv = np.stack([u, v], -1).astype(np.float32)
+    world = unproject(uv, clip.depths[frame, v, u], clip.intrinsics[frame], clip.extrinsics[frame])
+    return world, clip.video[frame, v, u]
+
+
+def _cloud(clip: Clip, frame: int, points: int, near: float) -> go.Scatter3d:
+    xyz, rgb = _cloud_points(clip, frame, points, near)
+    level = (rgb.astype(int) * _LEVELS) // 256
+    code = (level @ [_LEVELS**2, _LEVELS, 1]).astype(np.uint8)
+    channel = (np.arange(_LEVELS) * 255 / (_LEVELS - 1)).round().astype(int)
+    count = _LEVELS**3
+    cells = np.stack(np.meshgrid(channel, channel, channel, indexing="ij"), -1).reshape(-1, 3)
+    scale = [[i / (count - 1), f"rgb({r},{g},{b})"] for i, (r, g, b) in enumerate(cells)]
+    marker = {"size": 2.2, "color": code, "colorscale": scale, "cmin": 0, "cmax": count - 1}
+    x, y, z = xyz.astype(np.float32).T
+    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="skip", name="scene")
+
+
+def _tails(tracks: Tracks, frame: int, tail: int, scale: list) -> go.Scatter3d:
+    start = max(0, frame - tail)
+    path = tracks.xyz[start : frame + 1].astype(np.float32)
+    gap = np.full((1, path.shape[1], 3), np.nan, np.float32)  # NaN lifts the pen between tracks
+    x, y, z = np.concatenate([path, gap]).transpose(2, 1, 0).reshape(3, -1)
+    index = np.repeat(np.arange(path.shape[1], dtype=np.uint8), len(path) + 1)
+    line = {"width": 3, "color": index, "colorscale": scale, "cmin": 0, "cmax": max(path.shape[1] - 1, 1)}
+    return go.Scatter3d(x=x, y=y, z=z, mode="lines", line=line, hoverinfo="skip", name="tails")
+
+
+def _heads(tracks: Tracks, frame: int, colors: np.ndarray) -> go.Scatter3d:
+    x, y, z = tracks.xyz[frame].astype(np.float32).T
+    seen = tracks.visible[frame]
+    marker = {
+        "size": 4,
+        "color": [to_hex(c) for c in colors],
+        "symbol": ["circle" if s else "circle-open" for s in seen],
+    }
+    label = [f"track {n}, {'visible' if s else 'occluded'}" for n, s in enumerate(seen)]
+    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, text=label, hoverinfo="text", name="points")
+
+
+def _color_scale(colors: np.ndarray) -> list:
+    last = max(len(colors) - 1, 1)
+    scale = [[n / last, to_hex(c)] for n, c in enumerate(colors)]
+    return scale if len(scale) > 1 else [[0, scale[0][1]], [1, scale[0][1]]]
+
+
+def _limits(xyz: np.ndarray) -> np.ndarray:
+    low, high = np.nanquantile(xyz, [0.002, 0.998], axis=0)
+    return np.stack([low, high], -1) + 0.03 * (high - low).max() * np.array([-1, 1])
+
+
+def _scene(clip: Clip, tracks: Tracks, near: float) -> dict[str, object]:
+    steps = np.linspace(0, len(clip) - 1, min(len(clip), 6)).astype(int)
+    cloud = np.concatenate([_cloud_points(clip, t, 800, near)[0] for t in steps])
+    ranges = _limits(np.concatenate([cloud, tracks.xyz[steps].reshape(-1, 3)]))
+    axis = {"showspikes": False, "title": {"font": {"size": 10}}, "tickfont": {"size": 9}, "backgroundcolor": "#f4f5f7"}
+    axes = {f"{k}axis": axis | {"range": r.tolist(), "autorange": False} for k, r in zip("xyz", ranges, strict=True)}
+    return axes | {"aspectmode": "data", "camera": _camera(clip, np.median(cloud, axis=0), ranges)}
+
+
+def _camera(clip: Clip, target: np.ndarray, ranges: np.ndarray) -> dict[str, object]:
+    """A view from behind and above the clip's first camera, in the scene's own units."""
+    pose = invert(clip.extrinsics[0])
+    up = -pose[:3, 1]
+    back = pose[:3, 3] - target
+    eye = target + 1.5 * back + 0.35 * np.linalg.norm(back) * up
+    # With aspectmode "data" a scene unit is the geometric mean of the three ranges, counted from their middle.
+    unit, middle = np.prod(np.ptp(ranges, axis=-1)) ** (1 / 3), ranges.mean(-1)
+    vectors = {"up": up, "eye": (eye - middle) / unit, "center": (target - middle) / unit}
+    return {name: {k: float(x) for k, x in zip("xyz", vector, strict=True)} for name, vector in vectors.items()}
+
+
+def _step_args(duration: int, mode: str) -> dict[str, object]:
+    return {"mode": mode, "frame": {"duration": duration, "redraw": True}, "transition": {"duration": 0}}
+
+
+def _slider(frames: int) -> dict[str, object]:
+    steps = [
+        {"label": str(t), "method": "animate", "args": [[str(t)], _step_args(0, "immediate")]} for t in range(frames)
+    ]
+    return {"steps": steps, "currentvalue": {"prefix": "frame "}, "x": 0.12, "len": 0.85, "pad": {"t": 8}}
+
+
+def _play_button() -> dict[str, object]:
+    play = {"label": "play", "method": "animate", "args": [None, _step_args(120, "immediate") | {"fromcurrent": True}]}
+    pause = {"label": "pause", "method": "animate", "args": [[None], _step_args(0, "immediate")]}
+    return {
+        "type": "buttons",
+        "buttons": [play, pause],
+        "x": 0.1,
+        "y": 0,
+        "xanchor": "right",
+        "yanchor": "top",
+        "pad": {"t": 30},
+    }

@@ -1,0 +1,53 @@
+"""Explorers: thin shells that call a pure drawing function when a control moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import ipywidgets as widgets
+from IPython.display import Image, display
+from matplotlib.figure import Figure
+
+from tapip3d_lite.ui.figures import png_bytes
+
+Control = tuple[int, int] | tuple[float, float] | Sequence[str]
+
+
+def explore(draw: Callable[..., Figure], **controls: Control) -> widgets.VBox:
+    """Sliders and menus over a pure function `draw(**values) -> Figure`.
+
+    Args:
+        draw: returns a matplotlib figure; the notebook shows one static result of it above the explorer.
+        controls: argument name to (low, high) for a slider (whole numbers, or floats in 20 steps), or to a list of
+            strings for a menu. The first value, or the middle of the range, is shown first.
+
+    Returns:
+        The controls above the figure. A `ValueError` of `draw` is shown instead of the figure.
+    """
+    boxes = {name: _control(name, values) for name, values in controls.items()}
+    output = widgets.Output()
+
+    def redraw(_change: object = None) -> None:
+        try:
+            picture: object = Image(png_bytes(draw(**{name: box.value for name, box in boxes.items()})))
+        except ValueError as error:
+            picture = f"{error}"
+        with output:
+            output.clear_output(wait=True)
+            display(picture)
+
+    for box in boxes.values():
+        box.observe(redraw, names="value")
+    redraw()
+    return widgets.VBox([widgets.HBox(list(boxes.values()), layout={"flex_flow": "row wrap"}), output])
+
+
+def _control(name: str, values: Control) -> widgets.Widget:
+    if all(isinstance(v, str) for v in values):
+        return widgets.Dropdown(options=list(values), description=name)
+    low, high = values
+    if isinstance(low, int) and isinstance(high, int):
+        middle = (low + high) // 2
+        return widgets.IntSlider(middle, low, high, description=name, continuous_update=False)
+    middle, step = (low + high) / 2, (high - low) / 20
+    return widgets.FloatSlider(middle, min=low, max=high, step=step, description=name, continuous_update=False)

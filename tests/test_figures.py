@@ -1,0 +1,140 @@
+"""Figures are checked by their state, not by their pixels."""
+
+import base64
+import io
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+import tapip3d_lite as t3d
+from tapip3d_lite.ui.figures import png_bytes
+from tapip3d_lite.ui.widgets import explore
+
+
+@pytest.fixture(scope="module")
+def clip():
+    clip = t3d.simulate_clip(seed=1, frames=5, size=(48, 64), tracks=40)
+    depths = clip.depths.copy()
+    depths[:, :6, :6] = 0
+    return replace(clip, depths=depths)
+
+
+def unpack(value):
+    if isinstance(value, dict):
+        return np.frombuffer(base64.b64decode(value["bdata"]), value["dtype"])
+    return np.asarray(value, float)
+
+
+def test_3d_scene_keeps_ranges_and_has_a_step_for_each_frame(clip):
+    figure = t3d.figures.tracks_3d(clip, clip.tracks, points=300)
+    layout = figure.layout
+    assert len(figure.frames) == len(layout.sliders[0].steps) == 5
+    assert [f.name for f in figure.frames] == [s.args[0][0] for s in layout.sliders[0].steps] == list("01234")
+    assert layout.uirevision == "keep" and layout.scene.aspectmode == "data"
+    for step in layout.sliders[0].steps:
+        assert step.args[1]["mode"] == "immediate" and step.args[1]["frame"]["redraw"] is True
+    for axis in (layout.scene.xaxis, layout.scene.yaxis, layout.scene.zaxis):
+        assert axis.autorange is False and axis.range[0] < axis.range[1]
+    for frame in figure.frames:
+        cloud, tails, heads = frame.data
+        assert 0 < len(cloud.x) <= 300 and np.isfinite(cloud.x).all() and np.asarray(cloud.x).dtype == np.float32
+        assert len(heads.x) == len(heads.marker.symbol) == len(set(tails.line.color.tolist()))
+
+
+def test_heads_stand_on_the_tracks_and_show_occlusion(clip):
+    figure = t3d.figures.tracks_3d(clip, clip.tracks, points=50, max_tracks=1000)
+    heads = figure.frames[3].data[2]
+    drawn = np.stack([heads.x, heads.y, heads.z], -1)
+    distance = np.linalg.norm(drawn[:, None] - clip.tracks.xyz[3][None], axis=-1)
+    assert distance.min(1).max() < 1e-6
+    hollow = np.array([s == "circle-open" for s in heads.marker.symbol])
+    np.testing.assert_array_equal(hollow, ~clip.tracks.visible[3][distance.argmin(1)])
+
+
+def test_colours_of_a_track_agree_between_figures(clip):
+    colors = t3d.figures.track_colors(clip, clip.tracks)
+    np.testing.assert_array_equal(t3d.figures.track_colors(clip, clip.tracks.select(slice(5, 9))), colors[5:9])
+    flat = t3d.figures.frame_with_tracks(clip, clip.tracks, 2).axes[0]
+    assert [tuple(line.get_color()) for line in flat.lines] == [tuple(c) for c in colors]
+
+
+def test_frame_markers_are_hollow_where_occluded_and_at_the_projection(clip):
+    ax = t3d.figures.frame_with_tracks(clip, clip.tracks, 3, truth=clip.tracks).axes[0]
+    hollow, filled = ax.collections
+    seen = clip.tracks.visible[3]
+    assert (len(hollow.get_offsets()), len(filled.get_offsets())) == ((~seen).sum(), seen.sum())
+    uv, _ = t3d.geometry.project(clip.tracks.xyz[3], clip.intrinsics[3], clip.extrinsics[3])
+    np.testing.assert_allclose(filled.get_offsets(), uv[seen], atol=1e-3)
+    assert len(hollow.get_facecolors()) == 0
+
+
+def test_depth_masks_invalid_pixels(clip):
+    figure = t3d.figures.depth_map(clip, 0)
+    shown = figure.axes[0].images[0].get_array()
+    assert shown.mask[:6, :6].all() and not shown.mask[20:, 20:].any()
+    assert "scene units" in figure.axes[1].get_ylabel()
+
+
+def test_html_is_self_contained_and_png_is_a_picture(clip, tmp_path):
+    t3d.figures.save_html(t3d.figures.tracks_3d(clip, clip.tracks, points=200), tmp_path / "a.html")
+    page = (tmp_path / "a.html").read_text()
+    assert not re.findall(r"<(?:script|link)[^>]+(?:src|href)=", page)
+    assert "Plotly.newPlot" in page and len(page) < 8e6
+    t3d.figures.save_png(t3d.figures.overview(clip, clip.tracks), tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as picture:
+        assert np.asarray(picture.convert("RGB")).std() > 20
+
+
+def test_notebook_bundle_has_a_static_twin(clip):
+    shown = t3d.figures.show_3d(
+        t3d.figures.tracks_3d(clip, clip.tracks, points=200), t3d.figures.tracks_3d_static(clip, clip.tracks)
+    )
+    bundle = shown._repr_mimebundle_()
+    assert len(bundle["application/vnd.plotly.v1+json"]["frames"]) == 5
+    cloud = bundle["application/vnd.plotly.v1+json"]["data"][0]
+    assert len(unpack(cloud["x"])) == 200
+    with Image.open(io.BytesIO(bundle["image/png"])) as picture:
+        assert picture.size[0] > 300
+    assert "5 frames" in bundle["text/plain"]
+
+
+def test_sheets_bars_and_curves(clip):
+    sheet = t3d.figures.contact_sheet([clip, clip], frames=3)
+    assert len(sheet.axes) == 6 and sheet.axes[0].get_title() == "t = 0"
+    bars = t3d.figures.scores_bar({"a": {"AJ3D": 0.5, "APD3D": 0.25, "OA": 1}, "b": {"AJ3D": 0, "APD3D": 0, "OA": 0}})
+    assert [p.get_height() for p in bars.axes[0].patches] == [0.5, 0.25, 1, 0, 0, 0]
+    curves = t3d.figures.tracks_over_time({"truth": clip.tracks.xyz[:, 0]})
+    np.testing.assert_array_equal(curves.axes[2].lines[0].get_ydata(), clip.tracks.xyz[:, 0, 2])
+
+
+def test_no_figure_stays_open(clip):
+    import matplotlib.pyplot as plt
+
+    before = plt.get_fignums()
+    t3d.figures.frame_with_tracks(clip, clip.tracks, 0)
+    assert plt.get_fignums() == before
+    assert isinstance(t3d.figures.depth_map(clip, 0), Figure)
+
+
+def test_explorer_redraws_with_the_values_of_its_controls():
+    calls = []
+
+    def draw(frame, space, noise):
+        calls.append((frame, space, noise))
+        if frame == 9:
+            raise ValueError("no such frame")
+        return Figure(figsize=(1, 1))
+
+    box = explore(draw, frame=(0, 9), space=["world", "camera"], noise=(0.0, 1.0))
+    frame, space, _ = box.children[0].children
+    space.value = "camera"
+    frame.value = 9
+    assert calls == [(4, "world", 0.5), (4, "camera", 0.5), (9, "camera", 0.5)]
+
+
+def test_png_is_deterministic(clip):
+    assert png_bytes(t3d.figures.depth_map(clip, 0)) == png_bytes(t3d.figures.depth_map(clip, 0))
