@@ -75,7 +75,7 @@ def project(points: Array, intrinsics: Array, extrinsics: Array | None = None, m
         points: (..., N, 3) in the world frame, or in the camera frame without extrinsics.
         intrinsics: (..., 3, 3), pixels.
         extrinsics: (..., 4, 4) world to camera, or None.
-        min_z: divisor for points at or behind the camera, so that the result stays finite; their z tells.
+        min_z: smallest divisor, for points at or behind the camera, so that the result stays finite; their z tells.
 
     Returns:
         uv (..., N, 2) in pixels and z (..., N), the signed z-depth in the camera frame.
@@ -83,11 +83,9 @@ def project(points: Array, intrinsics: Array, extrinsics: Array | None = None, m
     xp = _library(points)
     camera = points if extrinsics is None else transform(points, extrinsics)
     z = camera[..., 2]
-    x, y = camera[..., 0], camera[..., 1]
-    safe = xp.clip(z, min_z, None)
-    u = (intrinsics[..., None, 0, 0] * x + intrinsics[..., None, 0, 1] * y) / safe + intrinsics[..., None, 0, 2]
-    v = intrinsics[..., None, 1, 1] * y / safe + intrinsics[..., None, 1, 2]
-    return xp.stack([u, v], -1), z
+    # K X first, then the division: the order of the released model, whose numbers depend on the last bit.
+    homogeneous = camera @ intrinsics.swapaxes(-1, -2)
+    return homogeneous[..., :2] / xp.clip(z, min_z, None)[..., None], z
 
 
 def point_map(depths: Array, intrinsics: Array, extrinsics: Array | None = None) -> Array:

@@ -114,15 +114,22 @@ def _nearest(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) 
         distance.masked_fill_(~valid[:, None], torch.inf)
     near = distance.topk(min(count + 1, points.shape[1]), dim=-1, largest=False)
     indices = near.indices[..., :count].clone()
-    # topk leaves the order of equal distances open; only rows that contain a tie are sorted again, stably.
+    # topk leaves the order of equal distances open; only rows that contain a tie are searched again.
     tied = (near.values[..., 1:] == near.values[..., :-1]).any(-1)
     if bool(tied.any()):
-        indices[tied] = distance[tied].sort(dim=-1, stable=True).indices[:, :count]
+        indices[tied] = _by_distance_and_index(distance[tied], count)
     if valid is not None:
         chosen = distance.gather(-1, indices)
         nearest = torch.where(chosen[..., :1].isinf(), 0, indices[..., :1])
         indices = torch.where(chosen.isinf(), nearest, indices)
     return indices
+
+
+def _by_distance_and_index(distance: Tensor, count: int) -> Tensor:
+    # The bits of a non-negative float order like the float itself, so one integer holds (distance, index).
+    index = torch.arange(distance.shape[-1], device=distance.device)
+    key = (distance.view(torch.int32).long() << 32) + index
+    return key.topk(count, dim=-1, largest=False).values & 0xFFFFFFFF
 
 
 def squared_distances(queries: Tensor, points: Tensor) -> Tensor:

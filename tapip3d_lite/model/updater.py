@@ -30,6 +30,10 @@ class Transformer(nn.Module):
         self.scatter = nn.ModuleList(Block(*sizes, cross=True) for _ in range(config.space_depth))
         self.head = nn.Linear(config.hidden, config.outputs - 2 if config.separate_vis_head else config.outputs)
         self.vis_head = nn.Linear(config.hidden, 2) if config.separate_vis_head else None
+        # An untrained tracker should leave points nearly where they are.
+        for head in filter(None, (self.head, self.vis_head)):
+            nn.init.normal_(head.weight, std=1e-3)
+            nn.init.zeros_(head.bias)
 
     def forward(self, tokens: Tensor, active: Tensor | None = None) -> Tensor:
         """Propose corrections.
