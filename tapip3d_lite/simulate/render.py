@@ -2,7 +2,8 @@
 
 MuJoCo casts the rays of one origin at once. Colours are taken at the pixels' corners and averaged over each pixel's
 four, which costs one ray per pixel and leaves no jagged edges. Shadows of a disc-shaped sun use interleaved sampling:
-each corner looks at one of nine points on the sun, and a 3x3 mean over the same body's corners sees all nine.
+every second corner, as on a checkerboard, looks at one of four points on the sun, and a 3x3 mean over the corners on
+the same body sees all four.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from tapip3d_lite.simulate.scene import HIDDEN_GROUP, Scene
 
 SUN_DISTANCE = 30.0
-SUN_RADIUS = 1.6  # metres at that distance: penumbras about as wide as on a lightly clouded day
+SUN_RADIUS = 1.1  # metres at that distance: penumbras about as wide as on a lightly clouded day
 BACKDROP_GLOW = 0.8  # the backdrop is not lit by the sun: real horizons are not lit by one lamp
 _TONES = np.rint(255 * np.linspace(0, 1, 4096) ** (1 / 2.2)).astype(np.uint8)
 
@@ -143,37 +144,46 @@ def _sunlit(
 ) -> np.ndarray:
     """The visible share of the sun (R,) float32 at points on a grid of `shape`; 1 without a look where not `asked`."""
     rows, columns = np.indices(shape).reshape(2, -1)
-    interleaved = (rows % 3) * 3 + columns % 3
+    # Numbered along the diagonals, so that each 2x2 block of the checkerboard's fields looks at all four points.
+    index = (rows + columns) // 2 % 2 * 2 + (rows - columns) // 2 % 2
+    fields = (rows + columns) % 2 == 0
     lit = np.ones(len(points), np.float32)
-    for index, position in enumerate(_sun_points(scene.sun)):
-        chosen = np.flatnonzero((interleaved == index) & asked)
+    for number, position in enumerate(_sun_points(scene.sun)):
+        chosen = np.flatnonzero((index == number) & fields & asked)
         towards = points[chosen] - position
         distance = np.sqrt(np.einsum("rc,rc->r", towards, towards))
-        hits = cast(scene.model, data, position, towards / distance[:, None], shadow=True)
-        lit[chosen] = hits.distance > distance - 0.01
-    return _mean_same_geom(lit.reshape(shape), geom.reshape(shape)).ravel()
+        towards /= distance[:, None]
+        near = _may_hit(scene, data, position, towards)
+        hits = cast(scene.model, data, position, towards[near], shadow=True)
+        lit[chosen[near]] = hits.distance > distance[near] - 0.01
+    return _mean_same_geom(lit.reshape(shape), geom.reshape(shape), fields.reshape(shape)).ravel()
+
+
+def _may_hit(scene: Scene, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Which rays (R,) bool pass through any body's bounding sphere; most do not, and need no casting."""
+    center = data.geom_xpos[scene.first_body :] - origin
+    distance = np.linalg.norm(center, axis=-1)
+    least = np.sqrt(np.maximum(0, 1 - (scene.model.geom_rbound[scene.first_body :] / distance) ** 2))
+    return (rays @ (center / distance[:, None]).T > least).any(1)
 
 
 def _sun_points(sun: np.ndarray) -> np.ndarray:
-    """Nine points (9, 3), evenly spread over the sun's disc."""
+    """Four points (4, 3) around the sun's disc."""
     side = np.cross(sun, [0.0, 0, 1])
-    side /= np.linalg.norm(side)
-    radius = SUN_RADIUS * np.sqrt((np.arange(9) + 0.5) / 9)
-    angle = np.arange(9) * np.pi * (3 - np.sqrt(5))  # the golden angle
-    offsets = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(sun, side)
-    return SUN_DISTANCE * sun + radius[:, None] * offsets
+    side *= SUN_RADIUS / np.linalg.norm(side)
+    other = np.cross(sun, side)
+    return SUN_DISTANCE * sun + np.stack([side, other, -other, -side])
 
 
-def _mean_same_geom(value: np.ndarray, geom: np.ndarray) -> np.ndarray:
-    """3x3 mean of `value` over the neighbours that lie on the same geom."""
-    padded = np.pad(value, 1, mode="edge")
-    same = np.pad(geom, 1, mode="constant", constant_values=-2)
-    total, count = np.zeros_like(value), np.zeros_like(value)
-    height, width = value.shape
+def _mean_same_geom(value: np.ndarray, geom: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """3x3 mean of the `known` values over the neighbours on the same geom; 1 where there are none."""
+    value, known = np.pad(value * known, 1), np.pad(known.astype(np.float32), 1)
+    same = np.pad(geom, 1, constant_values=-2)
+    total, count = np.zeros(geom.shape, np.float32), np.zeros(geom.shape, np.float32)
     for row in range(3):
         for column in range(3):
-            window = slice(row, row + height), slice(column, column + width)
+            window = slice(row, row + geom.shape[0]), slice(column, column + geom.shape[1])
             match = same[window] == geom
-            total += padded[window] * match
-            count += match
-    return total / count
+            total += value[window] * match
+            count += known[window] * match
+    return np.where(count > 0, total / np.maximum(count, 1), 1)

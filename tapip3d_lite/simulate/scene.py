@@ -91,7 +91,9 @@ def random_scene(rng: np.random.Generator, config: SimulationConfig, azimuth: fl
 def _random_body(
     rng: np.random.Generator, config: SimulationConfig, moving: bool, others: list[Body], shared: Texture | None
 ) -> Body:
-    shape = config.shapes[rng.integers(len(config.shapes))]
+    simple = [s for s in config.shapes if s in PRIMITIVES]  # half of the bodies, however many meshes there are
+    kinds = simple if simple and rng.uniform() < 0.5 else config.shapes
+    shape = kinds[rng.integers(len(kinds))]
     half = rng.uniform(0.28, 0.55) * (1 if shape in MESHES else rng.uniform(0.65, 1, 3))
     half = np.broadcast_to(half, 3)
     for _ in range(50):
