@@ -35,13 +35,14 @@ class Report(dict):
 
     def add(self, stage, ours, theirs, tolerance):
         difference = float((ours.double() - theirs.double()).abs().max()) if ours.numel() else 0.0
-        self[stage] = max(self.get(stage, (0.0, 0))[0], difference), tolerance
+        worst = np.maximum(self.get(stage, (0.0, 0))[0], difference)  # unlike max(), keeps NaN
+        self[stage] = float(worst), tolerance
 
     def same_sets(self, stage, ours, theirs):
         self.add(stage, ours.sort(-1).values, theirs.sort(-1).values, 0)
 
     def failures(self):
-        return {k: v for k, v in self.items() if not v[0] <= v[1]}
+        return {stage: value for stage, value in self.items() if not value[0] <= value[1]}
 
 
 class Golden:
@@ -104,18 +105,28 @@ def _cloud(golden, report):
         report.add("mean and std", norm.mean.flatten(), golden[f"{name}.mean_coords"], 1e-6)
         report.add("mean and std", norm.std.flatten().expand(3), golden[f"{name}.std_coords"], 1e-6)
         for i, near in enumerate(x.normalized(norm) for x in support):
-            report.add("normalised points", norm.normalize(scene.levels[i].points)[0].movedim(-1, 1), golden[f"{name}.pyr{i}.norm_coords"], 1e-5)
+            report.add(
+                "normalised points",
+                norm.normalize(scene.levels[i].points)[0].movedim(-1, 1),
+                golden[f"{name}.pyr{i}.norm_coords"],
+                1e-5,
+            )
             order, other = near.indices[0].argsort(-1), golden[f"support_knn_idx{i}"].argsort(-1) + 1
             other = torch.cat([torch.zeros_like(other[:, :1]), other], 1)
             for stage, ours in (("feats_raw", near.features), ("offsets", near.offsets)):
-                rows = [x.gather(1, o[..., None].expand(-1, -1, x.shape[-1])) for x, o in ((ours[0], order), (golden[f"{name}.sup{i}.{stage}"], other))]
+                rows = [
+                    x.gather(1, o[..., None].expand(-1, -1, x.shape[-1]))
+                    for x, o in ((ours[0], order), (golden[f"{name}.sup{i}.{stage}"], other))
+                ]
                 report.add(f"support {stage.split('_')[0]}", *rows, 5e-5 if stage == "feats_raw" else 1e-5)
 
 
 def _forced_window(golden, name, start, stop, columns):
     """The recorded normalised window, as our tracker would hold it."""
     tracker, config = golden.tracker, golden.tracker.config
-    norm = Normalizer(golden[f"{name}.mean_coords"].view(1, 1, 1, 3), golden[f"{name}.std_coords"].view(1, 1, 1, 3), config.norm_scale)
+    norm = Normalizer(
+        golden[f"{name}.mean_coords"].view(1, 1, 1, 3), golden[f"{name}.std_coords"].view(1, 1, 1, 3), config.norm_scale
+    )
     scene = _scene(golden, golden["image_feats"][None, : len(golden.frames)]).cut(start, stop)
     levels, kept = [], []
     for i, level in enumerate(scene.levels):
@@ -140,7 +151,9 @@ def _window(golden, report, name, start, stop):
         coords, logits = tracker.update(window, coords, logits)
         report.add("coords, forced", coords[0], golden[f"{step}.norm_coords_out"], 1e-5)
         report.add("logits, forced", logits[0], golden[f"{step}.visibs_out"], 5e-5)
-        report.add("updater output, end to end", seen.output[0, ..., :4], golden[f"{step}.updater_output"][..., :4], 5e-5)
+        report.add(
+            "updater output, end to end", seen.output[0, ..., :4], golden[f"{step}.updater_output"][..., :4], 5e-5
+        )
         if i == 0:
             _first_iteration(golden, report, step, window, seen)
     seen.close()
@@ -156,7 +169,9 @@ def _first_iteration(golden, report, step, window, seen):
     # One float32 ulp of a coordinate, times 2^13 inside the sine, is 1e-3: the noise of the raw Fourier features.
     report.add("token: fourier", token[..., 1 + width :], theirs[..., 1 + width :], 4e-3)
     report.add("token: visibility, n2n", token[..., : 1 + width], theirs[..., : 1 + width], 3e-4)
-    report.add("updater, forced", tracker.updater(theirs[None])[0, ..., :4], golden[f"{step}.updater_output"][..., :4], 2e-5)
+    report.add(
+        "updater, forced", tracker.updater(theirs[None])[0, ..., :4], golden[f"{step}.updater_output"][..., :4], 2e-5
+    )
     if f"{step[:2]}.n2n_l0_support_tokens" in golden or f"{step}.n2n_l0_support_tokens" in golden:
         prefix = step if f"{step}.n2n_l0_support_tokens" in golden else step[:2]
         support = golden[f"{prefix}.n2n_l0_support_tokens"]
@@ -164,7 +179,9 @@ def _first_iteration(golden, report, step, window, seen):
         near, theirs = seen.near[0], golden[f"{prefix}.n2n_l0_context_tokens"]
         ours = (near.features + tracker.context.embed.offset(0, near.offsets))[0].flatten(0, 1)
         orders = near.indices[0].flatten(0, 1).argsort(-1), golden[f"{step}.context_knn_idx0"].flatten(0, 1).argsort(-1)
-        rows = [x.gather(1, o[..., None].expand(-1, -1, x.shape[-1])) for x, o in zip((ours, theirs), orders, strict=True)]
+        rows = [
+            x.gather(1, o[..., None].expand(-1, -1, x.shape[-1])) for x, o in zip((ours, theirs), orders, strict=True)
+        ]
         report.add("context tokens", *rows, 3e-4)
 
 
@@ -194,15 +211,15 @@ class Recording:
 
 def free_running(tracker, golden, report, iterations, prefix="", space=None):
     """Nothing but the clip goes in; each update of each window and the result are compared."""
-    space, done = golden.space if space is None else make_space(space), 0
-    for step in tracker.steps(golden.frames, golden.queries, iterations=iterations, space=space):
+    space = golden.space if space is None else make_space(space)
+    steps = tracker.steps(golden.frames, golden.queries, iterations=iterations, space=space)
+    for done, step in enumerate(steps):
         name = f"{prefix}w{2 * step.start // tracker.config.window}.i{step.iteration}"
         tolerance = _FREE[min(done, len(_FREE) - 1)]
         theirs = golden[f"{name}.coords_world"][:, step.columns], golden[f"{name}.visib_logits"][:, step.columns]
         count = len(theirs[0])  # padded frames are cut from the record
         report.add(f"free run, update {done + 1}: coords", step.xyz[0, :count], theirs[0], tolerance)
         report.add(f"free run, update {done + 1}: logits", step.logits[0, :count], theirs[1], 30 * tolerance)
-        done += 1
     xyz, logits = tracker(golden.frames, golden.queries, iterations=iterations, space=space)
     out = prefix or "out."
     report.add("final: coords", xyz[0], golden[f"{out}coords"], _FREE[-1])
@@ -238,13 +255,37 @@ def measure_bidirectional(path):
     return report
 
 
+@torch.no_grad()
+def measure_checkpoint(path):
+    """A checkpoint file in the authors' format, in both spaces."""
+    from tapip3d_lite.model.weights import load_official
+
+    golden, report = Golden(path), Report()
+    tracker = load_official(path.with_name("checkpoint_small.pth"))
+    report.add("features", tracker.encoder(golden.frames.rgb[:, :1])[0, 0], golden["image_feats_f0"], 1e-5)
+    for prefix, space in (("raw.", "world"), ("local.", "camera")):
+        part = Report()
+        free_running(tracker, golden, part, golden.config["num_iters"], prefix, space)
+        report |= {f"{space}: {stage}": value for stage, value in part.items()}
+    return report
+
+
+def measurements():
+    """(name, function) of every recorded file beside the checkout."""
+    yield from ((name, measure) for name in STAGED)
+    yield "A_bidir", measure_bidirectional
+    yield "checkpoint_small_expected", measure_checkpoint
+
+
 def main():
     failed = 0
-    for name in (*STAGED, "A_bidir"):
-        report = (measure if name in STAGED else measure_bidirectional)(GOLDEN / f"{name}.npz")
+    for name, function in measurements():
+        report = function(GOLDEN / f"{name}.npz")
         failed += len(report.failures())
         for stage, (difference, tolerance) in report.items():
-            sys.stdout.write(f"{name:10s} {stage:34s} {difference:9.1e} <= {tolerance:7.0e} {'' if difference <= tolerance else 'FAILS'}\n")
+            sys.stdout.write(
+                f"{name:10s} {stage:34s} {difference:9.1e} <= {tolerance:7.0e} {'' if difference <= tolerance else 'FAILS'}\n"
+            )
     sys.exit(failed)
 
 
