@@ -1,0 +1,186 @@
+"""The field's metrics: TAPVid-3D (AJ, APD, OA in 3D) and TAP-Vid (the same in the image).
+
+Both count, for thresholds of k = 1, 2, 4, 8, 16 pixels, how often a visible true point is hit and how often "visible"
+is claimed rightly. In 3D a pixel is a length: k p_z / sqrt(fx fy) at the true depth p_z.
+
+    OA    = mean [V = W]
+    APD_k = sum(inside V) / sum(V)
+    J_k   = sum(inside V W) / (sum(V) + sum(W (1 - inside V)))
+
+with V true and W predicted visibility. AJ and APD are means over k. Source: Koppula et al., TAPVid-3D (2024), section
+4; Doersch et al., TAP-Vid (2022), section 3.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+Array = np.ndarray
+
+THRESHOLDS = (1, 2, 4, 8, 16)
+SCALINGS = ("median", "mean", "none", "per_trajectory", "reproduce_2d", "median_on_queries")
+MODES = ("first", "strided")
+
+
+def tapvid3d_metrics(
+    gt_xyz: Array,
+    gt_visible: Array,
+    xyz: Array,
+    visible: Array,
+    intrinsics: Array,
+    queries: Array | None = None,
+    scaling: str = "median",
+    per_track: bool = False,
+) -> dict[str, float | Array]:
+    """TAPVid-3D metrics of one video.
+
+    Args:
+        gt_xyz: (T, N, 3) true points, camera frame of each t, scene units.
+        gt_visible: (T, N) bool.
+        xyz: (T, N, 3) predicted points, camera frame of each t.
+        visible: (T, N) bool.
+        intrinsics: (T, 3, 3) or (3, 3), used as given (the benchmark scales them by 256 / min(H, W) first).
+        queries: (N, 4) rows (t, ...) or (N,) query frames; needed by `per_trajectory` and `median_on_queries`.
+        scaling: how the prediction's scale is matched to the truth before scoring, one of `SCALINGS`.
+        per_track: return arrays (N,), each track scored alone (with the video's common scale), instead of numbers.
+
+    Returns:
+        `AJ3D`, `APD3D`, `OA` and for each k `jaccard_k`, `within_k`: fractions in [0, 1], NaN where undefined.
+
+    Raises:
+        ValueError: shapes that do not fit, an unknown scaling, or queries missing where the scaling needs them.
+    """
+    p, q = np.asarray(gt_xyz, np.float64), np.asarray(xyz, np.float64)
+    v, w = _checked(p, gt_visible, q, visible, 3)
+    focal = np.asarray(intrinsics, np.float64)
+    if focal.shape[-2:] != (3, 3) or focal.ndim not in (2, 3) or (focal.ndim == 3 and len(focal) != len(p)):
+        raise ValueError(f"intrinsics: expected ({len(p)}, 3, 3) or (3, 3), got {focal.shape}")
+    scale = scale_factor(p, q, v & w, _query_frames(queries, p.shape[1]), scaling)
+    pixel = p[..., 2] / np.sqrt(focal[..., 0, 0] * focal[..., 1, 1])[..., None]
+    with np.errstate(invalid="ignore", over="ignore"):
+        squared = ((scale * q - p) ** 2).sum(-1)
+        inside = {k: squared < (k * pixel) ** 2 for k in THRESHOLDS}
+    return _scores(inside, v, w, np.ones_like(v), "3D", per_track)
+
+
+def tapvid2d_metrics(
+    gt_uv: Array,
+    gt_visible: Array,
+    uv: Array,
+    visible: Array,
+    queries: Array,
+    mode: str = "first",
+    per_track: bool = False,
+) -> dict[str, float | Array]:
+    """TAP-Vid metrics of one video.
+
+    Args:
+        gt_uv: (T, N, 2) true pixels on a 256 x 256 raster.
+        gt_visible: (T, N) bool.
+        uv: (T, N, 2) predicted pixels on the same raster.
+        visible: (T, N) bool.
+        queries: (N, 3 or 4) rows (t, ...) or (N,) query frames.
+        mode: `"first"` scores frames after the query, `"strided"` all but the query frame.
+        per_track: return arrays (N,) instead of numbers.
+
+    Returns:
+        `AJ2D`, `APD2D`, `OA`, `jaccard_k`, `within_k`; fractions, NaN where undefined.
+
+    Raises:
+        ValueError: shapes that do not fit, or an unknown mode.
+    """
+    p, q = np.asarray(gt_uv, np.float64), np.asarray(uv, np.float64)
+    v, w = _checked(p, gt_visible, q, visible, 2)
+    if mode not in MODES:
+        raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
+    t, start = np.arange(len(p))[:, None], _query_frames(queries, p.shape[1])[None]
+    scored = t > start if mode == "first" else t != start
+    with np.errstate(invalid="ignore", over="ignore"):
+        squared = ((q - p) ** 2).sum(-1)
+        inside = {k: squared < k**2 for k in THRESHOLDS}
+    return _scores(inside, v, w, scored, "2D", per_track)
+
+
+def scale_factor(p: Array, q: Array, both: Array, start: Array | None, scaling: str) -> Array | float:
+    """The factor that multiplies the prediction before it is scored.
+
+    Args:
+        p: (T, N, 3) true points, camera frame.
+        q: (T, N, 3) predicted points, camera frame.
+        both: (T, N) bool, where truth and prediction are visible.
+        start: (N,) query frames, or None where the scaling does not need them.
+        scaling: one of `SCALINGS`.
+
+    Returns:
+        A number, (1, N, 1) or (T, N, 1); NaN where nothing is visible in both, so that every point is a miss.
+
+    Raises:
+        ValueError: unknown scaling, or `start` missing.
+    """
+    if scaling not in SCALINGS:
+        raise ValueError(f"scaling: expected one of {', '.join(SCALINGS)}, got {scaling!r}")
+    if scaling == "none":
+        return 1.0
+    if scaling == "reproduce_2d":
+        return p[..., 2:] / np.maximum(q[..., 2:], 1e-12)
+    if scaling in ("median", "mean"):
+        return _norm_ratio(p, q, both, np.nanmedian if scaling == "median" else np.nanmean)
+    if start is None:
+        raise ValueError(f"queries: scaling {scaling!r} needs the query frames; pass queries=(N, 4) or (N,)")
+    track = np.arange(p.shape[1])
+    if scaling == "per_trajectory":
+        pz, qz = (np.maximum(x[start, track, 2], 1e-12) for x in (p, q))
+        return (pz / qz)[None, :, None]
+    at_query = np.zeros_like(both)
+    at_query[start, track] = True
+    return _norm_ratio(p, q, both & at_query, np.nanmedian)
+
+
+def _scores(inside: dict[int, Array], v: Array, w: Array, scored: Array, suffix: str, per_track: bool) -> dict:
+    axis = 0 if per_track else None
+    scores = {"OA": _ratio(((v == w) & scored).sum(axis), scored.sum(axis))}
+    visible = (v & scored).sum(axis)
+    for k, hit in inside.items():
+        true = hit & v & scored
+        scores[f"within_{k}"] = _ratio(true.sum(axis), visible)
+        claimed_wrongly = (w & ~true & scored).sum(axis)
+        scores[f"jaccard_{k}"] = _ratio((true & w).sum(axis), visible + claimed_wrongly)
+    for name, part in ((f"AJ{suffix}", "jaccard"), (f"APD{suffix}", "within")):
+        scores[name] = np.mean([scores[f"{part}_{k}"] for k in inside], axis=0)
+    return scores if per_track else {name: float(value) for name, value in scores.items()}
+
+
+def _ratio(numerator: Array, denominator: Array) -> Array:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(denominator > 0, numerator / np.maximum(denominator, 1), np.nan)
+
+
+def _norm_ratio(p: Array, q: Array, where: Array, average: object) -> float:
+    """Average |p| / average |q|, or NaN without a common visible point, which makes every point a miss."""
+    if not where.any():
+        return np.nan
+    with np.errstate(invalid="ignore", over="ignore"):
+        true, predicted = (np.maximum(np.linalg.norm(x[where], axis=-1), 1e-6) for x in (p, q))
+    return float(average(true) / average(predicted))
+
+
+def _query_frames(queries: Array | None, count: int) -> Array | None:
+    if queries is None:
+        return None
+    frames = np.asarray(queries)
+    frames = frames if frames.ndim == 1 else frames[:, 0]
+    if frames.shape != (count,):
+        raise ValueError(f"queries: expected {count} rows (t, ...) as there are tracks, got {np.shape(queries)}")
+    return frames.astype(int)
+
+
+def _checked(p: Array, v: Array, q: Array, w: Array, last: int) -> tuple[Array, Array]:
+    v, w = np.asarray(v), np.asarray(w)
+    if p.ndim != 3 or p.shape[-1] != last:
+        raise ValueError(f"truth: expected (T, N, {last}), got {p.shape}; time comes first")
+    if q.shape != p.shape:
+        raise ValueError(f"prediction: expected {p.shape} as the truth, got {q.shape}; track the same queries")
+    for name, flags in (("gt_visible", v), ("visible", w)):
+        if flags.shape != p.shape[:2] or flags.dtype != bool:
+            raise ValueError(f"{name}: expected {p.shape[:2]} bool, got {flags.shape} {flags.dtype}")
+    return v, w

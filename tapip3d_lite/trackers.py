@@ -1,0 +1,49 @@
+"""Trackers by name: shipped weights, weight files, and the baselines without learning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker
+
+_BASELINES = {"static": StaticTracker, "klt": KltTracker}
+_WEIGHTS = Path(__file__).parent / "weights"
+
+
+class TrackerLike(Protocol):
+    """What every tracker offers."""
+
+    def track(self, clip: Clip, queries: np.ndarray | None = None, **options: object) -> Tracks:
+        """3D tracks of `queries` (N, 4), of the clip's own queries, or of a grid on the first frame."""
+
+
+def list_trackers() -> list[str]:
+    """Names that `load_tracker` takes: shipped weights first, then the baselines."""
+    return sorted(path.stem for path in _WEIGHTS.glob("*.safetensors")) + list(_BASELINES)
+
+
+def load_tracker(name: str | Path = "lite", device: str = "cpu") -> TrackerLike:
+    """A tracker by name, or from a weights file.
+
+    Args:
+        name: one of `list_trackers()`, or the path of a `.safetensors` file.
+        device: where a learnt tracker computes, `"cpu"` or `"cuda"`.
+
+    Raises:
+        ValueError: neither a known name nor a file.
+    """
+    if str(name) in _BASELINES:
+        return _BASELINES[str(name)]()
+    shipped = _WEIGHTS / f"{name}.safetensors"
+    path = shipped if shipped.exists() else Path(name)
+    if not path.is_file():
+        raise ValueError(
+            f"load_tracker: no tracker {str(name)!r}; choose {', '.join(list_trackers())} or a weights file"
+        )
+    from tapip3d_lite.model.weights import load_weights
+
+    return load_weights(path, device=device)

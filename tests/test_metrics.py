@@ -1,0 +1,187 @@
+"""Metrics against the field's reference values, and against explicit loops."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tapip3d_lite as t3d
+from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
+from tapip3d_lite.evaluation.metrics import MODES, SCALINGS, THRESHOLDS
+
+ROOT = Path(__file__).resolve().parents[1]
+OWN = ROOT / "tests" / "data"
+SHARED = ROOT.parent / "shared" / "golden"
+
+
+def camera_matrix(f):
+    return np.array([[f[0], 0, f[2]], [0, f[1], f[3]], [0, 0, 1.0]])
+
+
+def reference(folder, name):
+    path = folder / f"{name}.npz"
+    if not path.exists():
+        pytest.skip(f"{path.name}: reference vectors are not beside this checkout")
+    return np.load(path)
+
+
+def agrees(got, expected, where):
+    for name, value in expected.items():
+        value = np.nan if value is None else value
+        np.testing.assert_allclose(got[name], value, rtol=0, atol=1e-9, err_msg=f"{where} {name}")
+
+
+@pytest.mark.parametrize("folder", [OWN, SHARED], ids=["own", "shared"])
+def test_tapvid3d_reference_values(folder):
+    with reference(folder, "tapvid3d_metrics") as data:
+        cases = json.loads(str(data["expected_json"]))
+        for case in cases:
+            i = case["case"]
+            for scaling, expected in case["expected"].items():
+                got = t3d.tapvid3d_metrics(
+                    *(data[f"{i}/{k}"] for k in ("gt_xyz", "gt_visible", "xyz", "visible")),
+                    camera_matrix(data[f"{i}/fx_fy_cx_cy"]),
+                    data[f"{i}/query_frame"],
+                    scaling,
+                )
+                agrees(got, expected or {}, (i, scaling))
+        assert {s for c in cases for s in c["expected"]} == set(SCALINGS)
+        assert any(v is None or v != v for c in cases for e in c["expected"].values() for v in (e or {}).values())
+
+
+@pytest.mark.parametrize("folder", [OWN, SHARED], ids=["own", "shared"])
+def test_tapvid2d_reference_values(folder):
+    with reference(folder, "tapvid2d_metrics") as data:
+        cases = json.loads(str(data["expected_json"]))
+        for case in cases:
+            i = case["case"]
+            for mode in MODES:
+                arrays = (data[f"{i}/{k}"] for k in ("gt_uv", "gt_visible", "uv", "visible", "query_frame"))
+                agrees(t3d.tapvid2d_metrics(*arrays, mode=mode), case["expected"][mode], (i, mode))
+
+
+def random_case(rng):
+    frames, count = rng.integers(1, 6), rng.integers(1, 5)
+    p = rng.normal(size=(frames, count, 3)) + [0, 0, 4]
+    q = p * rng.uniform(0.8, 1.2) + rng.normal(size=p.shape) * rng.choice([0.01, 0.1])
+    v, w = rng.random((2, frames, count)) < 0.7
+    return p, v, q, w, camera_matrix(rng.uniform(50, 200, 4))
+
+
+def loop_3d(p, v, q, w, k, scale):
+    correct = claimed = 0
+    within = dict.fromkeys(THRESHOLDS, 0)
+    both, wrong = dict.fromkeys(THRESHOLDS, 0), dict.fromkeys(THRESHOLDS, 0)
+    for t in range(p.shape[0]):
+        for n in range(p.shape[1]):
+            correct += v[t, n] == w[t, n]
+            claimed += w[t, n]
+            for threshold in THRESHOLDS:
+                radius = threshold * p[t, n, 2] / np.sqrt(k[0, 0] * k[1, 1])
+                hit = sum((scale * q[t, n, i] - p[t, n, i]) ** 2 for i in range(3)) < radius**2
+                within[threshold] += hit and v[t, n]
+                both[threshold] += hit and v[t, n] and w[t, n]
+                wrong[threshold] += w[t, n] and not (hit and v[t, n])
+    visible = v.sum()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        apd = np.mean([np.float64(within[x]) / visible for x in THRESHOLDS])
+        aj = np.mean([np.float64(both[x]) / (visible + wrong[x]) for x in THRESHOLDS])
+    return {"OA": correct / v.size, "APD3D": apd, "AJ3D": aj}
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_tapvid3d_is_the_loop(seed):
+    p, v, q, w, k = random_case(np.random.default_rng(seed))
+    agrees(t3d.tapvid3d_metrics(p, v, q, w, k, scaling="none"), loop_3d(p, v, q, w, k, 1.0), seed)
+    both = v & w
+    scale = (
+        np.median(np.linalg.norm(p[both], axis=-1)) / np.median(np.linalg.norm(q[both], axis=-1))
+        if both.any()
+        else np.nan
+    )
+    agrees(t3d.tapvid3d_metrics(p, v, q, w, k), loop_3d(p, v, q, w, k, scale), seed)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_per_track_scores_are_the_scores_of_single_tracks(seed):
+    p, v, q, w, k = random_case(np.random.default_rng(seed))
+    together = t3d.tapvid3d_metrics(p, v, q, w, k, scaling="none", per_track=True)
+    for n in range(p.shape[1]):
+        one = slice(n, n + 1)
+        alone = t3d.tapvid3d_metrics(p[:, one], v[:, one], q[:, one], w[:, one], k, scaling="none")
+        agrees({name: values[n] for name, values in together.items()}, alone, n)
+
+
+def test_undefined_scores():
+    p = np.full((2, 1, 3), 2.0)
+    seen, hidden = np.ones((2, 1), bool), np.zeros((2, 1), bool)
+    nothing = t3d.tapvid3d_metrics(p, hidden, p, hidden, np.eye(3))
+    assert np.isnan(nothing["APD3D"]) and np.isnan(nothing["AJ3D"]) and nothing["OA"] == 1
+    claimed = t3d.tapvid3d_metrics(p, hidden, p, seen, np.eye(3))
+    assert np.isnan(claimed["APD3D"]) and claimed["AJ3D"] == 0
+    missed = t3d.tapvid3d_metrics(p, seen, p, hidden, np.eye(3))
+    assert missed["AJ3D"] == 0 and missed["APD3D"] == 0
+    assert t3d.tapvid3d_metrics(p, seen, p, hidden, np.eye(3), scaling="none")["APD3D"] == 1
+
+
+def test_bad_arguments_are_named():
+    p, v, q, w, k = random_case(np.random.default_rng(0))
+    for arguments, message in [
+        ((p[..., :2], v, q, w, k), "truth: expected"),
+        ((p, v, q[:-1], w, k), "prediction: expected"),
+        ((p, v[:-1], q, w, k), "gt_visible"),
+        ((p, v, q, w.astype(float), k), "visible"),
+        ((p, v, q, w, k[:2]), "intrinsics"),
+        ((p, v, q, w, k, [0] * 99), "queries"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            t3d.tapvid3d_metrics(*arguments)
+    with pytest.raises(ValueError, match="scaling: expected one of median"):
+        t3d.tapvid3d_metrics(p, v, q, w, k, scaling="best")
+    with pytest.raises(ValueError, match="needs the query frames"):
+        t3d.tapvid3d_metrics(p, v, q, w, k, scaling="per_trajectory")
+    with pytest.raises(ValueError, match="mode"):
+        t3d.tapvid2d_metrics(p[..., :2], v, q[..., :2], w, np.zeros(p.shape[1]), mode="last")
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return t3d.simulate_clip(seed=5, frames=8, size=(48, 64), tracks=60)
+
+
+def test_evaluate_gives_the_truth_full_marks(clip):
+    scores = t3d.evaluate(clip.tracks, clip)
+    for name, value in scores.items():
+        assert value == (0 if name.startswith("EPE") else 1), name
+    assert {"AJ3D_dynamic", "AJ3D_static", "AJ3D_none", "AJ2D"} <= set(scores)
+
+
+def test_evaluate_scales_intrinsics_to_256_pixels(clip):
+    # An error of 1.5 pixels of the 256-pixel raster, sideways: inside 2 pixels, outside 1.
+    camera = t3d.geometry.transform(clip.tracks.xyz, clip.extrinsics)
+    focal = np.sqrt(clip.intrinsics[:, 0, 0] * clip.intrinsics[:, 1, 1])[:, None] * 256 / 48
+    camera[..., 0] += 1.5 * camera[..., 2] / focal
+    moved = t3d.geometry.transform(camera, t3d.geometry.invert(clip.extrinsics)).astype(np.float32)
+    scores = t3d.evaluate(t3d.Tracks(moved, clip.tracks.visible, clip.queries), clip)
+    assert scores["APD3D_none"] == pytest.approx(0.8)
+
+
+def test_evaluate_knows_a_wrong_scale_from_wrong_tracks(clip):
+    centre = t3d.geometry.invert(clip.extrinsics)[:, None, :3, 3]
+    larger = centre + 1.3 * (clip.tracks.xyz - centre)
+    scores = t3d.evaluate(t3d.Tracks(larger, clip.tracks.visible, clip.queries), clip)
+    assert scores["APD3D"] > 0.999 > 0.2 > scores["APD3D_none"]
+
+
+def test_evaluate_refuses_other_queries(clip):
+    with pytest.raises(ValueError, match="queries"):
+        t3d.evaluate(clip.tracks.select(slice(3)), clip)
+    with pytest.raises(ValueError, match="no true tracks"):
+        t3d.evaluate(clip.tracks, t3d.Clip(clip.video, clip.depths, clip.intrinsics, clip.extrinsics))
+
+
+def test_means_and_tables():
+    mean = mean_scores([{"a": 1.0, "b": np.nan}, {"a": 0.0, "b": 0.5}, {"a": 0.5}])
+    assert mean == {"a": 0.5, "b": 0.5}
+    assert score_table({"x": mean}, ("a", "b")).splitlines()[-1] == "| x | 0.500 | 0.500 |"
