@@ -1,6 +1,104 @@
-"""Datasets of simulated clips (being written)."""
+"""A folder of simulated clips: written by all cores, one file a seed, continued after an interruption."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from dataclasses import asdict
+from pathlib import Path
+
+from tqdm import tqdm
+
+from tapip3d_lite.files import atomic_path
+from tapip3d_lite.simulate.config import SimulationConfig
+from tapip3d_lite.simulate.simulator import simulate_clip
+
+DESCRIPTION = "dataset.json"
 
 
-def simulate_dataset() -> None:
-    """Write a folder of clips."""
-    raise NotImplementedError
+def simulate_dataset(
+    out: str | Path,
+    count: int,
+    config: SimulationConfig | None = None,
+    first_seed: int = 0,
+    workers: int | None = None,
+    progress: bool = True,
+) -> list[Path]:
+    """Write clips with the seeds first_seed ... first_seed + count - 1 into a folder.
+
+    Clips that are there already are kept, so an interrupted run continues where it stopped and a larger `count` adds
+    clips. Files appear only when complete. `dataset.json` holds the configuration. A script that calls this with
+    several workers needs the usual `if __name__ == "__main__":`.
+
+    Args:
+        out: the folder; made if missing. Only one run may write to it at a time.
+        count: number of clips.
+        config: what they contain; default values if None.
+        first_seed: non-negative.
+        workers: processes; None for one per core.
+        progress: show a bar.
+
+    Returns:
+        The paths of all `count` clips, in the order of their seeds.
+
+    Raises:
+        ValueError: bad number, or the folder holds clips of another configuration.
+    """
+    for name, value, low in (("count", count, 1), ("first_seed", first_seed, 0), ("workers", workers or 1, 1)):
+        if not isinstance(value, int) or value < low:
+            raise ValueError(f"simulate_dataset: {name} must be a whole number of at least {low}, got {value!r}")
+    config, folder = config or SimulationConfig(), Path(out)
+    _claim(folder, config)
+    jobs = [(folder / f"clip_{seed:06d}.npz", seed, config) for seed in range(first_seed, first_seed + count)]
+    missing = [job for job in jobs if not job[0].exists()]
+    workers = min(workers or os.cpu_count() or 1, len(missing))
+    bar = tqdm(total=count, initial=count - len(missing), unit="clip", disable=not progress)
+    with bar:
+        if workers > 1:
+            with multiprocessing.get_context("spawn").Pool(workers) as pool:
+                for _ in pool.imap_unordered(_write, missing):
+                    bar.update()
+        else:
+            for job in missing:
+                _write(job)
+                bar.update()
+    return [job[0] for job in jobs]
+
+
+def read_config(folder: str | Path) -> SimulationConfig:
+    """The configuration of a dataset folder.
+
+    Raises:
+        ValueError: there is no readable `dataset.json`.
+    """
+    path = Path(folder) / DESCRIPTION
+    try:
+        return SimulationConfig(**json.loads(path.read_text())["simulation"])
+    except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: not a readable dataset description ({error}); choose another folder") from error
+
+
+def _claim(folder: Path, config: SimulationConfig) -> None:
+    """Make the folder ours: describe it, or check that its description is the same; drop half-written files."""
+    path = folder / DESCRIPTION
+    if path.exists():
+        stored, wanted = asdict(read_config(folder)), asdict(config)
+        different = [f"{k}={stored[k]!r} (now {wanted[k]!r})" for k in wanted if stored[k] != wanted[k]]
+        if different:
+            raise ValueError(
+                f"simulate_dataset: {folder} holds clips of another configuration: {', '.join(different)}; "
+                "use the same settings or another folder"
+            )
+    elif any(folder.glob("clip_*.npz")):
+        raise ValueError(f"simulate_dataset: {folder} holds clips but no {DESCRIPTION}; choose another folder")
+    else:
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps({"simulation": asdict(config)}, indent=2) + "\n")
+    for leftover in folder.glob(".clip_*.npz"):
+        leftover.unlink()
+
+
+def _write(job: tuple[Path, int, SimulationConfig]) -> None:
+    path, seed, config = job
+    simulate_clip(seed, config).save(path)

@@ -21,7 +21,7 @@ def roll_out(scene: Scene, frames: int, fps: float, offsets: np.ndarray) -> np.n
 
     Args:
         frames: T.
-        offsets: (S,) instants relative to a frame, in frames, each within [-0.5, 0.5].
+        offsets: (S,) instants relative to a frame, in frames, each within [-0.25, 0.25].
 
     Returns:
         (T, S, nq) positions for `mujoco.MjData.qpos`.
@@ -32,9 +32,10 @@ def roll_out(scene: Scene, frames: int, fps: float, offsets: np.ndarray) -> np.n
     steps = int(np.ceil(1 / (fps * STEP) / 4) * 4)  # a multiple of 4, so that a quarter of a frame is a whole step
     model, data = scene.model, mujoco.MjData(scene.model)
     model.opt.timestep = 1 / (fps * steps)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a NaN must show, not be reset away
     _settle(scene, data)
-    before = int(np.ceil(-offsets.min() * steps))
-    total = before + (frames - 1) * steps + int(np.ceil(offsets.max() * steps)) + 1
+    before = steps // 4  # with or without motion blur, so that both show the same motion
+    total = before + (frames - 1) * steps + int(offsets.max() * steps) + 1
     history = np.empty((total, model.nq))
     for index in range(total):
         history[index] = data.qpos

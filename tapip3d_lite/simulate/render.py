@@ -16,7 +16,7 @@ import numpy as np
 from tapip3d_lite.simulate.scene import HIDDEN_GROUP, Scene
 
 SUN_DISTANCE = 30.0
-SUN_RADIUS = 1.1  # metres at that distance: penumbras about as wide as on a lightly clouded day
+SUN_RADIUS = 0.8  # metres at that distance: penumbras about as wide as on a lightly clouded day
 BACKDROP_GLOW = 0.8  # the backdrop is not lit by the sun: real horizons are not lit by one lamp
 _TONES = np.rint(255 * np.linspace(0, 1, 4096) ** (1 / 2.2)).astype(np.uint8)
 

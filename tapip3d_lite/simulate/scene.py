@@ -131,16 +131,16 @@ def _compile(rng: np.random.Generator, config: SimulationConfig, bodies: list[Bo
     spec = mujoco.MjSpec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     extent = 18 if config.sky else 0  # 0 is endless; under the sky the floor must end before depths become absurd
-    floor = dict(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[extent, extent, 1])
+    floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [extent, extent, 1]}
     spec.worldbody.add_geom(**floor, friction=[0.7, 0.01, 0.003])
     if not config.sky:
-        dome = dict(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[DOME_RADIUS] * 3, contype=0, conaffinity=0)
+        dome = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [DOME_RADIUS] * 3, "contype": 0, "conaffinity": 0}
         spec.worldbody.add_geom(**dome, group=HIDDEN_GROUP)
     for index, body in enumerate(bodies):
         node = spec.worldbody.add_body(pos=body.position, quat=body.quaternion)
         if not body.fixed:
             node.add_freejoint()
-        solid = dict(density=400, friction=[rng.uniform(0.3, 0.8), 0.01, 0.003])
+        solid = {"density": 400, "friction": [rng.uniform(0.3, 0.8), 0.01, 0.003]}
         # A short, underdamped contact: bodies bounce a little, as thrown toys do.
         solid["solref"] = [0.02, rng.uniform(0.25, 0.8)]
         node.add_geom(**solid, **_geometry(rng, spec, body, index))
@@ -153,9 +153,9 @@ def _geometry(rng: np.random.Generator, spec: mujoco.MjSpec, body: Body, index: 
         half = body.half
         if body.shape == "capsule":  # its second size is half the straight part
             half = np.array([half.min() * 0.6, half.max() * 0.6, 0])
-        return dict(type=kind, size=half)
+        return {"type": kind, "size": half}
     vertices, faces = MESHES[body.shape](rng)
     mesh = spec.add_mesh(name=f"mesh{index}")
     mesh.uservert = (vertices * body.half).ravel()
     mesh.userface = np.asarray(faces).ravel()
-    return dict(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+    return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": mesh.name}

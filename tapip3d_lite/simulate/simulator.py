@@ -17,7 +17,8 @@ from tapip3d_lite.simulate.tracks import make_tracks, moving_geoms, sample_pixel
 
 ATTEMPTS = 30
 MIN_SEEN = 0.005  # of the image: a frame that shows less of moving bodies shows nothing to track
-MIN_DEPTH = 0.5  # metres: nearer than this a body would fill the image
+MIN_DEPTH = 0.5  # metres: nearer than this the camera may stand inside a body
+MAX_SHARE = 0.5  # of the image: more of one body hides everything else
 
 
 def simulate_clip(seed: int = 0, config: SimulationConfig | None = None, **overrides: object) -> Clip:
@@ -49,7 +50,7 @@ def simulate_clip(seed: int = 0, config: SimulationConfig | None = None, **overr
     for attempt in range(ATTEMPTS):
         try:
             return _attempt(np.random.default_rng([attempt, seed]), config, seed)
-        except UnstableSceneError as error:
+        except UnstableSceneError as error:  # noqa: PERF203 (a failure is what the loop is for)
             failure = error
     raise ValueError(
         f"simulate_clip: seed {seed} gave no usable scene in {ATTEMPTS} draws (last: {failure}); "
@@ -137,7 +138,10 @@ def _check_view(scene: Scene, geom: np.ndarray, depths: np.ndarray, moving: np.n
     """Refuse clips in which there is nothing to track or the camera stands inside a body."""
     bodies = geom >= scene.first_body
     seen = (moving[geom] & bodies).mean((1, 2)) > MIN_SEEN
-    if seen.mean() < 0.5:
+    if len(geom) > 1 and seen.mean() < 0.5:  # nothing moves in a single frame
         raise UnstableSceneError(f"moving bodies are in view in {seen.sum()} of {len(seen)} frames only")
+    largest = max((geom == g).mean((1, 2)).max() for g in range(scene.first_body, scene.model.ngeom))
+    if largest > MAX_SHARE:
+        raise UnstableSceneError(f"one body fills {largest:.0%} of a frame")
     if bodies.any() and depths[bodies].min() < MIN_DEPTH:
         raise UnstableSceneError(f"a body comes as near as {depths[bodies].min():.2g} m")
