@@ -1,0 +1,109 @@
+"""Guards over the committed notebooks, and a run of each with its exercises solved."""
+
+import json
+import re
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from tests.notebook_tools import FOLDER, clean, notebooks, run, solution_copy, solution_of, tags
+
+NOTEBOOKS = notebooks()
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+
+
+def read(path):
+    return nbformat.read(path, as_version=4)
+
+
+def code_cells(nb):
+    return [c for c in nb.cells if c.cell_type == "code"]
+
+
+def outputs(nb):
+    return [(c, o) for c in code_cells(nb) for o in c.outputs]
+
+
+def test_there_are_notebooks():
+    assert [p.stem[:2] for p in NOTEBOOKS] == [f"{i:02d}" for i in range(len(NOTEBOOKS))]
+    assert len(NOTEBOOKS) >= 3
+
+
+@each_notebook
+def test_opening(path):
+    nb = read(path)
+    nbformat.validate(nb)
+    opening = "".join(c.source for c in nb.cells[:3])
+    assert "By the end you will have shown that" in opening
+    assert re.search(r"\d+ min", opening)
+    assert sum("parameters" in tags(c) for c in nb.cells) == 1
+
+
+@each_notebook
+def test_outputs_are_fresh_and_clean(path):
+    nb = read(path)
+    cells = code_cells(nb)
+    assert [c.execution_count for c in cells] == list(range(1, len(cells) + 1)), "run `python3 run.py notebooks`"
+    for cell, output in outputs(nb):
+        assert output.output_type != "error", cell.source
+        assert not (output.output_type == "stream" and output.name == "stderr"), cell.source
+    text = json.dumps([o for _, o in outputs(nb)])
+    assert not re.search(r"(?<![\w.])(/home/|/root/|/work/|/tmp/|/Users/|[A-Z]:\\\\)", text)
+    assert "widgets" not in nb.metadata and "widget-view" not in text
+    assert path.stat().st_size < 2e6
+
+
+@each_notebook
+def test_checked_cells_have_outputs(path):
+    for cell in code_cells(read(path)):
+        if "nbval-check-output" in tags(cell):
+            assert cell.outputs, cell.source
+            assert all(o.output_type == "stream" or "text/plain" in o.data for o in cell.outputs)
+
+
+@each_notebook
+def test_every_figure_has_a_static_form(path):
+    scenes = 0
+    for cell, output in outputs(read(path)):
+        data = output.get("data", {})
+        if "application/vnd.plotly.v1+json" in data:
+            scenes += 1
+            assert "image/png" in data, cell.source
+    assert scenes <= 6
+
+
+@each_notebook
+def test_source_has_one_path_for_all(path):
+    source = "\n".join(c.source for c in code_cells(read(path)))
+    assert not re.search(r"TESTING|FigureWidget|kaleido|%cd|os\.chdir|sys\.path", source)
+
+
+@each_notebook
+def test_exercises_are_whole(path):
+    nb = read(path)
+    stubs = [i for i, c in enumerate(nb.cells) if "exercise" in tags(c)]
+    assert len(stubs) >= 3
+    for i in stubs:
+        assert "exercises.check(" in nb.cells[i + 1].source, nb.cells[i].source
+        assert len(solution_of(nb, i)) > 20
+        after = "".join(c.source for c in nb.cells[i + 1 : i + 5] if c.cell_type == "markdown")
+        assert after.count("<summary>Hint") >= 2, nb.cells[i].source
+        before = nb.cells[i - 1].source
+        assert re.search(r"\d+ min", before) and re.search(r"★|Difficulty", before), before
+
+
+@each_notebook
+def test_solutions_pass(path):
+    nb = run(clean(solution_copy(read(path))), FOLDER)
+    for cell, output in outputs(nb):
+        if "exercises.check(" in cell.source:
+            shown = output.get("data", {}).get("text/plain", "") or output.get("text", "")
+            assert "passed" in shown, f"{cell.source}\n{shown}"
+
+
+def test_stubs_are_not_attempted_in_the_committed_outputs():
+    for path in NOTEBOOKS:
+        for cell, output in outputs(read(path)):
+            if "exercises.check(" in cell.source and "data" in output:
+                assert "not attempted" in output["data"]["text/plain"], Path(path).name
