@@ -64,7 +64,7 @@ def demo(
 
 def check(clip: Positional[Path], /) -> None:
     """Look for the usual mix-ups in a clip: camera direction, axes, intrinsics, units, ray length."""
-    findings = t3d.check_clip(t3d.load_clip(clip))
+    findings = t3d.check_clip(t3d.load_clip(clip, points=False))
     print("\n".join(map(str, findings)) if findings else f"{clip}: nothing suspicious found")
 
 

@@ -188,10 +188,14 @@ class Clip:
         save_npz(path, arrays)
 
 
-def load_clip(path: str | Path) -> Clip:
+def load_clip(path: str | Path, points: bool = True) -> Clip:
     """Read a clip from the authors' input npz or from one of ours.
 
     A single (3, 3) or (4, 4) camera is taken for all frames.
+
+    Args:
+        path: the npz file.
+        points: False leaves queries and tracks aside, for a clip whose cameras are in doubt (`check_clip`).
 
     Raises:
         ValueError: the file is missing, truncated, not an npz, needs pickle, or its arrays do not fit together.
@@ -207,10 +211,10 @@ def load_clip(path: str | Path) -> Clip:
     for key in ("intrinsics", "extrinsics"):
         if arrays[key].ndim == 2:
             arrays[key] = np.repeat(arrays[key][None], frames, axis=0)
-    tracks = _stored_tracks(path, arrays)
+    tracks = _stored_tracks(path, arrays) if points else None
     return Clip(
         **{key: arrays[key] for key in _CLIP_KEYS},
-        queries=arrays.get("query_point"),
+        queries=arrays.get("query_point") if points else None,
         tracks=tracks,
         name=str(arrays["name"]) if "name" in arrays else Path(path).stem,
         fps=float(arrays["fps"]) if "fps" in arrays else 12.0,
@@ -254,7 +258,8 @@ def check_queries(clip: Clip, queries: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"queries: {int(outside.sum())} of {len(queries)} lie outside the view of their frame; row {first} = {queries[first].tolist()} "
             f"projects to (u, v) = {np.round(uv[first], 1).tolist()}, z = {z[first]:.3g} in a {width}x{height} image; "
-            "give (t, x, y, z) in world coordinates, or use queries_from_pixels for pixels"
+            "give (t, x, y, z) in world coordinates, or use queries_from_pixels for pixels; if all are outside, the cameras may be "
+            "wrong: check_clip(load_clip(path, points=False)) tells"
         )
     return queries
 
