@@ -7,17 +7,13 @@ checkout without those large files notices any later change. `python -m tests.ma
 from __future__ import annotations
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).parent))
-import parity
-
 from tapip3d_lite.model.official import official_config, parameter_names
 from tapip3d_lite.model.tracker import Tracker
+from tests import parity
 
 MODEL = {
     "name": "point_tracker_3d", "image_size": [48, 64], "seq_len": 8, "corr_levels": 2, "norm_mode": "isotropic",

@@ -1,8 +1,9 @@
 """The tracker computes the released model's numbers, at every recorded stage."""
 
-import parity
 import pytest
 import torch
+
+from tests import parity
 
 needs_golden = pytest.mark.skipif(not parity.GOLDEN.is_dir(), reason="the recorded runs are not beside this checkout")
 

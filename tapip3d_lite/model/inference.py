@@ -57,7 +57,7 @@ def track(
     Raises:
         ValueError: queries outside the clip, a space that the model was not made for, or a bad option.
     """
-    _check_options(tracker, space, visible_threshold, support_grid)
+    _check_options(tracker, space, depth_roi, visible_threshold, support_grid)
     queries = resolve_queries(clip, queries)
     clip = resize_clip(clip, tracker.config.image_size)
     frames = frames_from_clip(clip, device=next(tracker.parameters()).device)
@@ -109,12 +109,14 @@ def _bar(show: bool, tracker: Tracker, frames: int, iterations: int | None, pass
     return tqdm(total=total, disable=not show, desc="tracking")
 
 
-def _check_options(tracker: Tracker, space: str | None, threshold: float, grid: int) -> None:
+def _check_options(tracker: Tracker, space: Any, roi: Any, threshold: float, grid: int) -> None:
     own = tracker.config.space
     if space not in (None, own) and not (own in _INTERCHANGEABLE and space in _INTERCHANGEABLE):
         raise ValueError(
             f"space: this tracker was made for {own!r}, got {space!r}; only camera and world are exchangeable"
         )
+    if isinstance(roi, str) and roi != "auto":
+        raise ValueError(f'depth_roi: expected "auto", None or (near, far), got {roi!r}')
     if not 0 <= threshold <= 1:
         raise ValueError(f"visible_threshold: expected a probability in [0, 1], got {threshold}")
     if grid < 0:

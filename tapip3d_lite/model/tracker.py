@@ -89,7 +89,9 @@ class Tracker(nn.Module):
             state: trajectories, which are updated in place; made from the queries if None.
         """
         config, iterations = self.config, self.config.iterations if iterations is None else iterations
-        self._check(frames, queries, iterations)
+        self._check(frames, iterations)
+        if queries.shape[1] == 0:
+            return
         space, half = make_space(space or self.space), config.window // 2
         features = self.encoder(frames.rgb) if features is None else features
         state = State.start(queries, frames, space, half) if state is None else state
@@ -200,14 +202,10 @@ class Tracker(nn.Module):
         """Track points of one clip; see `inference.track` for the options."""
         return inference.track(self, clip, queries, **options)
 
-    def _check(self, frames: Frames, queries: Tensor, iterations: int) -> None:
+    def _check(self, frames: Frames, iterations: int) -> None:
         if frames.size != self.config.image_size:
             raise ValueError(
                 f"frames: expected images of {self.config.image_size}, got {frames.size}; use frames_from_clip(clip, size)"
-            )
-        if queries.ndim != 3 or queries.shape[0] != len(frames.depths) or queries.shape[2] != 4:
-            raise ValueError(
-                f"queries: expected ({len(frames.depths)}, N, 4) rows (t, x, y, z), got {tuple(queries.shape)}"
             )
         if iterations < 1:
             raise ValueError(f"iterations: expected at least 1, got {iterations}")

@@ -38,6 +38,10 @@ class State:
     @classmethod
     def start(cls, queries: Tensor, frames: Frames, space: Any, multiple: int) -> State:
         """Trajectories that stand still at their queries (B, N, 4), given in the world."""
+        if queries.ndim != 3 or queries.shape[0] != len(frames.depths) or queries.shape[2] != 4:
+            raise ValueError(
+                f"queries: expected ({len(frames.depths)}, N, 4) rows (t, x, y, z), got {tuple(queries.shape)}"
+            )
         times = queries[..., 0].long()
         if bool(((times < 0) | (times >= len(frames))).any()):
             raise ValueError(
