@@ -1,5 +1,6 @@
 """The tracker as a whole: windows, batches, spaces, training steps, and what a user calls."""
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -207,6 +208,15 @@ def test_bf16_autocast_keeps_coordinates_in_float32(golden):
         xyz, logits = run(golden, iterations=1)
     assert xyz.dtype == logits.dtype == torch.float32
     assert torch.allclose(xyz, run(golden, iterations=1)[0], atol=0.1)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_a_gpu_gives_the_same_tracks(golden):
+    tracker = copy.deepcopy(golden.tracker).cuda()
+    xyz, logits = tracker(golden.frames.to("cuda"), golden.queries.cuda(), iterations=1)
+    expected = run(golden, iterations=1)
+    assert torch.allclose(xyz.cpu(), expected[0], atol=1e-3)
+    assert torch.allclose(logits.cpu(), expected[1], atol=3e-2)
 
 
 # --- configuration ------------------------------------------------------------------------------------------------

@@ -5,26 +5,23 @@ Paper: section 4 (protocol): a grid of support queries, depth's region of intere
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.queries import grid_queries, resolve_queries
 
-if TYPE_CHECKING:
-    from tapip3d_lite.model.tracker import Tracker
-
 _INTERCHANGEABLE = ("camera", "world")
 
 
 @torch.no_grad()
 def track(
-    tracker: Tracker,
+    tracker: nn.Module,
     clip: Clip,
     queries: np.ndarray | None = None,
     space: str | None = None,
@@ -38,7 +35,7 @@ def track(
     """Track points through a clip.
 
     Args:
-        tracker: the model.
+        tracker: a `Tracker`.
         clip: T frames of any image size; resized to the model's.
         queries: (N, 4) rows (t, x, y, z), world; None: the clip's own, else a grid on the first frame.
         space: `"camera"` or `"world"` in place of the config's, if that is one of the two.
@@ -79,7 +76,7 @@ def track(
 
 
 def _one_way(
-    tracker: Tracker, frames: Frames, features: Tensor, queries: np.ndarray, grid: np.ndarray, options: dict, bar: Any
+    tracker: nn.Module, frames: Frames, features: Tensor, queries: np.ndarray, grid: np.ndarray, options: dict, bar: Any
 ) -> tuple[np.ndarray, np.ndarray]:
     rows = torch.from_numpy(np.concatenate([queries, grid]).astype(np.float32)).to(frames.depths.device)
     handle = tracker.updater.register_forward_hook(lambda *_: bar.update())
@@ -100,7 +97,7 @@ def _flip_time(rows: np.ndarray, frames: int) -> np.ndarray:
     return rows
 
 
-def _bar(show: bool, tracker: Tracker, frames: int, iterations: int | None, passes: int) -> Any:
+def _bar(show: bool, tracker: nn.Module, frames: int, iterations: int | None, passes: int) -> Any:
     from tqdm.auto import tqdm
 
     half = tracker.config.window // 2
@@ -109,7 +106,7 @@ def _bar(show: bool, tracker: Tracker, frames: int, iterations: int | None, pass
     return tqdm(total=total, disable=not show, desc="tracking")
 
 
-def _check_options(tracker: Tracker, space: Any, roi: Any, threshold: float, grid: int) -> None:
+def _check_options(tracker: nn.Module, space: Any, roi: Any, threshold: float, grid: int) -> None:
     own = tracker.config.space
     if space not in (None, own) and not (own in _INTERCHANGEABLE and space in _INTERCHANGEABLE):
         raise ValueError(
