@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 
 import plotly.graph_objects as go
+from IPython import get_ipython
 from matplotlib.figure import Figure
 
 from tapip3d_lite.files import atomic_path
@@ -77,3 +78,13 @@ def save_html(figure: go.Figure, path: str | Path) -> None:
     """Write a plotly figure as one page that needs no network (plotly.js is inside, about 5 MB), atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(figure.to_html(include_plotlyjs=True, auto_play=False, validate=False), encoding="utf-8")
+
+
+def _show_in_notebooks() -> None:
+    """Let a notebook show a bare `Figure` as PNG; IPython does so only for figures that pyplot made."""
+    shell = get_ipython()
+    if shell is not None:
+        shell.display_formatter.formatters["image/png"].for_type(Figure, png_bytes)
+
+
+_show_in_notebooks()

@@ -34,17 +34,17 @@ def tracks_3d(
     near = _near(clip)
     tracks = _drawn(clip, tracks, near, max_tracks)
     colors = track_colors(clip, tracks)
-    scale = _color_scale(colors)
-    frames = [
-        go.Frame(
-            name=str(t), data=[_cloud(clip, t, points, near), _tails(tracks, t, tail, scale), _heads(tracks, t, colors)]
-        )
-        for t in range(len(clip))
-    ]
-    figure = go.Figure(data=frames[0].data, frames=frames)
+    parts = [[_cloud(clip, t, points, near), _tails(tracks, t, tail), _heads(tracks, t)] for t in range(len(clip))]
+    frames = [go.Frame(name=str(t), data=[go.Scatter3d(part) for part in now]) for t, now in enumerate(parts)]
+    styles = _styles(colors)
+    # A frame carries only what changes; the rest stays with the traces and the colour axes of the layout.
+    figure = go.Figure(data=[go.Scatter3d(part).update(style) for part, style in zip(parts[0], styles, strict=True)])
+    figure.frames = frames
     figure.update_layout(
         title=title or clip.name,
         scene=_scene(clip, tracks, near),
+        coloraxis=_cloud_colors(),
+        coloraxis2={"colorscale": _color_scale(colors), "cmin": 0, "cmax": max(len(colors) - 1, 1), "showscale": False},
         margin={"l": 0, "r": 0, "t": 36, "b": 0},
         height=520,
         showlegend=False,
@@ -111,39 +111,45 @@ def _cloud_points(clip: Clip, frame: int, points: int, near: float) -> tuple[np.
     return world, clip.video[frame, v, u]
 
 
-def _cloud(clip: Clip, frame: int, points: int, near: float) -> go.Scatter3d:
+def _cloud(clip: Clip, frame: int, points: int, near: float) -> dict[str, object]:
     xyz, rgb = _cloud_points(clip, frame, points, near)
     level = (rgb.astype(int) * _LEVELS) // 256
     code = (level @ [_LEVELS**2, _LEVELS, 1]).astype(np.uint8)
-    channel = (np.arange(_LEVELS) * 255 / (_LEVELS - 1)).round().astype(int)
-    count = _LEVELS**3
-    cells = np.stack(np.meshgrid(channel, channel, channel, indexing="ij"), -1).reshape(-1, 3)
-    scale = [[i / (count - 1), f"rgb({r},{g},{b})"] for i, (r, g, b) in enumerate(cells)]
-    marker = {"size": 2.2, "color": code, "colorscale": scale, "cmin": 0, "cmax": count - 1}
     x, y, z = xyz.astype(np.float32).T
-    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="skip", name="scene")
+    return {"x": x, "y": y, "z": z, "marker": {"color": code}}
 
 
-def _tails(tracks: Tracks, frame: int, tail: int, scale: list) -> go.Scatter3d:
-    start = max(0, frame - tail)
-    path = tracks.xyz[start : frame + 1].astype(np.float32)
+def _tails(tracks: Tracks, frame: int, tail: int) -> dict[str, object]:
+    path = tracks.xyz[max(0, frame - tail) : frame + 1]
     gap = np.full((1, path.shape[1], 3), np.nan, np.float32)  # NaN lifts the pen between tracks
     x, y, z = np.concatenate([path, gap]).transpose(2, 1, 0).reshape(3, -1)
     index = np.repeat(np.arange(path.shape[1], dtype=np.uint8), len(path) + 1)
-    line = {"width": 3, "color": index, "colorscale": scale, "cmin": 0, "cmax": max(path.shape[1] - 1, 1)}
-    return go.Scatter3d(x=x, y=y, z=z, mode="lines", line=line, hoverinfo="skip", name="tails")
+    return {"x": x, "y": y, "z": z, "line": {"color": index}}
 
 
-def _heads(tracks: Tracks, frame: int, colors: np.ndarray) -> go.Scatter3d:
-    x, y, z = tracks.xyz[frame].astype(np.float32).T
-    seen = tracks.visible[frame]
-    marker = {
-        "size": 4,
-        "color": [to_hex(c) for c in colors],
-        "symbol": ["circle" if s else "circle-open" for s in seen],
-    }
-    label = [f"track {n}, {'visible' if s else 'occluded'}" for n, s in enumerate(seen)]
-    return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, text=label, hoverinfo="text", name="points")
+def _heads(tracks: Tracks, frame: int) -> dict[str, object]:
+    x, y, z = tracks.xyz[frame].T
+    symbols = ["circle" if seen else "circle-open" for seen in tracks.visible[frame]]
+    return {"x": x, "y": y, "z": z, "marker": {"symbol": symbols}}
+
+
+def _styles(colors: np.ndarray) -> list[dict[str, object]]:
+    """What stays alike over time: of the cloud, the tails and the heads."""
+    heads = {"size": 4, "color": [to_hex(c) for c in colors]}
+    text = [f"track {n} (hollow: occluded)" for n in range(len(colors))]
+    return [
+        {"name": "scene", "mode": "markers", "marker": {"size": 2.2, "coloraxis": "coloraxis"}, "hoverinfo": "skip"},
+        {"name": "tails", "mode": "lines", "line": {"width": 3, "coloraxis": "coloraxis2"}, "hoverinfo": "skip"},
+        {"name": "points", "mode": "markers", "marker": heads, "text": text, "hoverinfo": "text"},
+    ]
+
+
+def _cloud_colors() -> dict[str, object]:
+    """A colour axis that decodes the cloud's colour codes."""
+    channel = (np.arange(_LEVELS) * 255 / (_LEVELS - 1)).round().astype(int)
+    cells = np.stack(np.meshgrid(channel, channel, channel, indexing="ij"), -1).reshape(-1, 3)
+    scale = [[i / (len(cells) - 1), f"rgb({r},{g},{b})"] for i, (r, g, b) in enumerate(cells)]
+    return {"colorscale": scale, "cmin": 0, "cmax": len(cells) - 1, "showscale": False}
 
 
 def _color_scale(colors: np.ndarray) -> list:
