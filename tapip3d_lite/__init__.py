@@ -18,8 +18,10 @@ _HOMES = {
     "evaluation.metrics": ["tapvid2d_metrics", "tapvid3d_metrics"],
     "evaluation.evaluate": ["evaluate"],
     "trackers": ["list_trackers", "load_tracker"],
-    "model.tracker": ["Tracker", "TrackerConfig"],
-    "model.weights": ["from_official_state", "load_official"],
+    "model.config": ["TrackerConfig"],
+    "model.official": ["from_official_state"],
+    "model.tracker": ["Tracker"],
+    "model.weights": ["load_official", "load_weights", "save_weights"],
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 _MODULES = {"geometry": "geometry", "figures": "ui.figures", "exercises": "ui.exercises", "widgets": "ui.widgets"}

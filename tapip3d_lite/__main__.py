@@ -88,7 +88,25 @@ def samples(out: Path = Path("data_samples")) -> None:
     write_samples(out)
 
 
-COMMANDS = {"track": track, "demo": demo, "check": check, "simulate": simulate, "samples": samples}
+def picture(
+    clip: Positional[Path] = Path("data_samples/arc.npz"), /, out: Path = Path("data_samples/picture.png")
+) -> None:
+    """Draw the true tracks of a clip over its frames and depth, as in the README."""
+    loaded = t3d.load_clip(clip)
+    if loaded.tracks is None:
+        raise ValueError(f"{clip}: no true tracks to draw; use `track` with --png")
+    t3d.figures.save_png(t3d.figures.overview(loaded, loaded.tracks.select(slice(0, None, 3))), out)
+    print(f"wrote {out}")
+
+
+COMMANDS = {
+    "track": track,
+    "demo": demo,
+    "check": check,
+    "simulate": simulate,
+    "samples": samples,
+    "picture": picture,
+}
 
 
 def main() -> None:

@@ -1,0 +1,109 @@
+"""The command line and run.py, as a user calls them."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tapip3d_lite as t3d
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def call(*arguments, cwd=ROOT):
+    environment = os.environ | {"COLUMNS": "200", "PYTHONWARNINGS": "error"}
+    return subprocess.run(
+        [sys.executable, "-m", "tapip3d_lite", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+
+
+@pytest.fixture(scope="module")
+def clip_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("clip") / "c.npz"
+    t3d.simulate_clip(seed=2, frames=6, size=(48, 64), tracks=20).save(path)
+    return path
+
+
+def test_track_writes_result_page_and_picture(clip_file, tmp_path):
+    result = call(
+        "track",
+        clip_file,
+        "--tracker",
+        "klt",
+        "--out",
+        tmp_path / "o.npz",
+        "--html",
+        tmp_path / "o.html",
+        "--png",
+        tmp_path / "o.png",
+    )
+    assert result.returncode == 0, result.stderr
+    assert "AJ3D" in result.stdout and "20 points over 6 frames" in result.stdout
+    tracks = t3d.load_tracks(tmp_path / "o.npz")
+    expected = t3d.load_tracker("klt").track(t3d.load_clip(clip_file))
+    np.testing.assert_array_equal(tracks.xyz, expected.xyz)
+    assert "Plotly.newPlot" in (tmp_path / "o.html").read_text()
+    assert (tmp_path / "o.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_track_on_a_grid(clip_file):
+    result = call("track", clip_file, "--tracker", "static", "--no-own-queries", "--grid", "5")
+    assert result.returncode == 0, result.stderr
+    assert "25 points" in result.stdout and "AJ3D" not in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["track", "absent.npz"], "no such file"),
+        (["track", "CLIP", "--tracker", "nonsense"], "no tracker 'nonsense'"),
+        (["track", "CLIP", "--no-own-queries", "--grid", "0"], "grid_queries"),
+        (["simulate", "--out", "x", "--count", "0"], "count"),
+        (["simulate", "--out", "x", "--camera", "moon"], "camera"),
+        (["picture", "PLAIN"], "no true tracks"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(clip_file, tmp_path, arguments, message):
+    clip = t3d.load_clip(clip_file, points=False)
+    clip.save(tmp_path / "plain.npz")
+    names = {"CLIP": clip_file, "PLAIN": tmp_path / "plain.npz"}
+    result = call(*(names.get(a, a) for a in arguments), cwd=tmp_path)
+    assert result.returncode == 2
+    assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
+
+
+def test_usage_errors_also_exit_with_2():
+    assert call("fly").returncode == 2
+    assert call("track").returncode == 2
+
+
+def test_check_names_the_mix_up(clip_file, tmp_path):
+    clip = t3d.load_clip(clip_file)
+    assert "nothing suspicious" in call("check", clip_file).stdout
+    arrays = {k: getattr(clip, k) for k in ("video", "depths", "extrinsics")}
+    np.savez(tmp_path / "c.npz", **arrays, intrinsics=clip.intrinsics * np.array([[1 / 64], [1 / 48], [1]]))
+    assert "normalised_intrinsics" in call("check", tmp_path / "c.npz").stdout
+
+
+def test_simulate_writes_and_resumes(tmp_path):
+    options = ["simulate", "--out", tmp_path, "--frames", "4", "--size", "32", "32", "--tracks", "8", "--workers", "1"]
+    assert call(*options, "--count", "2").returncode == 0
+    first = sorted(tmp_path.glob("*.npz"))
+    before = [p.stat().st_mtime_ns for p in first]
+    assert call(*options, "--count", "3").returncode == 0
+    assert len(sorted(tmp_path.glob("*.npz"))) == 3
+    assert [p.stat().st_mtime_ns for p in first] == before
+
+
+def test_run_py_explains_itself_without_installing():
+    result = subprocess.run([sys.executable, str(ROOT / "run.py"), "--help"], capture_output=True, text=True)
+    assert result.returncode == 0
+    assert all(word in result.stdout for word in ("setup", "lab", "test", "demo", "notebooks"))
+    assert subprocess.run([sys.executable, str(ROOT / "run.py"), "fly"], capture_output=True).returncode == 2
