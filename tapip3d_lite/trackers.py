@@ -17,7 +17,18 @@ _WEIGHTS = Path(__file__).parent / "weights"
 class TrackerLike(Protocol):
     """What every tracker offers."""
 
-    def track(self, clip: Clip, queries: np.ndarray | None = None, **options: object) -> Tracks:
+    def track(
+        self,
+        clip: Clip,
+        queries: np.ndarray | None = None,
+        space: str | None = None,
+        iterations: int | None = None,
+        support_grid: int = 16,
+        bidirectional: bool = True,
+        depth_roi: str | tuple[float, float] | None = "auto",
+        visible_threshold: float = 0.9,
+        progress: bool = False,
+    ) -> Tracks:
         """3D tracks of `queries` (N, 4), of the clip's own queries, or of a grid on the first frame."""
 
 

@@ -48,6 +48,35 @@ def test_klt_interpolates_where_it_is_lost_and_says_so():
     np.testing.assert_array_equal(held, np.broadcast_to(pred.xyz[1, early], held.shape))
 
 
+def test_klt_finds_a_point_again_and_interpolates_the_gap():
+    clip = sliding_wall(step=0.5)
+    depths = clip.depths.copy()
+    depths[2:4] = 1.0
+    pred = t3d.load_tracker("klt").track(replace(clip, depths=depths))
+    early = clip.queries[:, 0] < 2
+    np.testing.assert_array_equal(pred.visible[:, early].all(1), [True, True, False, False, True, True])
+    assert np.abs(pred.xyz - clip.tracks.xyz)[:, early].max() < 0.25 * 2 / 70
+    ends = pred.xyz[1, early], pred.xyz[4, early]
+    np.testing.assert_allclose(pred.xyz[2, early], (2 * ends[0] + ends[1]) / 3, atol=1e-6)
+
+
+def test_klt_finds_nothing_where_another_texture_is():
+    clip = sliding_wall(step=0.5)
+    video = clip.video.copy()
+    video[3:] = np.random.default_rng(1).integers(0, 255, video[3:].shape, np.uint8)
+    pred = t3d.load_tracker("klt").track(replace(clip, video=video))
+    assert pred.visible[3:, clip.queries[:, 0] == 0].mean() < 0.3
+
+
+def test_klt_forward_only_knows_nothing_before_the_query():
+    clip = sliding_wall()
+    pred = t3d.load_tracker("klt").track(clip, bidirectional=False)
+    before = np.arange(len(clip))[:, None] < clip.queries[:, 0]
+    np.testing.assert_array_equal(pred.visible, ~before)
+    held = np.broadcast_to(clip.queries[:, 1:], pred.xyz.shape)
+    np.testing.assert_array_equal(pred.xyz[before], held[before])
+
+
 def test_klt_keeps_the_depth_of_the_nearer_surface_at_silhouettes():
     clip = sliding_wall(step=0)
     depths = clip.depths.copy()
@@ -65,13 +94,18 @@ def test_static_is_right_on_a_still_scene_and_sees_occlusion():
     pred = t3d.load_tracker("static").track(replace(clip, depths=depths))
     u = np.rint(t3d.geometry.project(clip.queries[:, 1:], clip.intrinsics[0])[0][:, 0])
     np.testing.assert_array_equal(pred.visible[1], u >= 50)
+    depths[1, :, :50] = 3.0  # what the points lay on has gone
+    pred = t3d.load_tracker("static").track(replace(clip, depths=depths))
+    np.testing.assert_array_equal(pred.visible[1], u >= 50)
 
 
 def test_klt_beats_static_on_moving_bodies():
     moving = []
     for seed in (1, 2):
         clip = t3d.simulate_clip(seed=seed, frames=12)
-        moving.append([t3d.evaluate(t3d.load_tracker(n).track(clip), clip)["AJ3D_dynamic"] for n in ("klt", "static")])
+        moving.append(
+            [t3d.evaluate(t3d.load_tracker(n).track(clip), clip)["AJ3D_none_dynamic"] for n in ("klt", "static")]
+        )
     klt, static = np.mean(moving, axis=0)
     assert klt > static
 
@@ -87,6 +121,8 @@ def test_baselines_take_the_arguments_of_track(name):
     without = replace(clip, queries=None, tracks=None)
     assert tracker.track(without).xyz.shape[1] == 16 * 16
     assert tracker.track(clip.cut(0, 1)).xyz.shape[0] == 1
+    with pytest.raises(TypeError, match="visible_treshold"):
+        tracker.track(clip, visible_treshold=0.5)
 
 
 def test_names():

@@ -133,6 +133,7 @@ def test_bad_arguments_are_named():
         ((p, v[:-1], q, w, k), "gt_visible"),
         ((p, v, q, w.astype(float), k), "visible"),
         ((p, v, q, w, k[:2]), "intrinsics"),
+        ((p, v, q, w, 0 * k), "intrinsics: expected positive"),
         ((p, v, q, w, k, [0] * 99), "queries"),
     ]:
         with pytest.raises(ValueError, match=message):
@@ -143,6 +144,53 @@ def test_bad_arguments_are_named():
         t3d.tapvid3d_metrics(p, v, q, w, k, scaling="per_trajectory")
     with pytest.raises(ValueError, match="mode"):
         t3d.tapvid2d_metrics(p[..., :2], v, q[..., :2], w, np.zeros(p.shape[1]), mode="last")
+
+
+@pytest.mark.parametrize("scaling", SCALINGS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
+def test_points_that_are_not_finite_are_misses(scaling, bad):
+    p = np.random.default_rng(0).normal(size=(4, 3, 3)) + [0, 0, 4]
+    seen, k, start = np.ones((4, 3), bool), camera_matrix([100, 100, 0, 0]), [0, 1, 2]
+    scores = t3d.tapvid3d_metrics(p, seen, np.full_like(p, bad), seen, k, start, scaling)
+    assert scores["AJ3D"] == scores["APD3D"] == 0
+    q = p.copy()
+    q[3, 0] = bad
+    scores = t3d.tapvid3d_metrics(p, seen, q, seen, k, start, scaling, per_track=True)
+    assert scores["APD3D"][0] <= 0.75
+    if scaling in ("none", "per_trajectory", "reproduce_2d", "median_on_queries"):
+        np.testing.assert_array_equal(scores["APD3D"], [0.75, 1, 1])
+
+
+@pytest.mark.parametrize("queries", [[4, 0], [-1, 0], [0.5, 0], [np.nan, 0], 0, [[[0], [0]]], ["a", "b"], None])
+def test_query_frames_are_checked(queries):
+    p, seen = np.ones((4, 2, 3)), np.ones((4, 2), bool)
+    with pytest.raises(ValueError, match="queries"):
+        t3d.tapvid3d_metrics(p, seen, p, seen, np.eye(3), queries, "per_trajectory")
+    with pytest.raises(ValueError, match="queries"):
+        t3d.tapvid2d_metrics(p[..., :2], seen, p[..., :2], seen, queries)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("seed", range(10))
+def test_tapvid2d_is_the_loop(mode, seed):
+    rng = np.random.default_rng(seed)
+    frames, count = rng.integers(1, 6), rng.integers(1, 5)
+    p = rng.uniform(0, 256, (frames, count, 2))
+    q = p + rng.normal(size=p.shape) * 4
+    (v, w), start = rng.random((2, frames, count)) < 0.7, rng.integers(0, frames, count)
+    within, jaccard = [], []
+    for k in THRESHOLDS:
+        hits = both = wrong = visible = correct = scored = 0
+        for t in range(frames):
+            for n in range(count):
+                if t > start[n] if mode == "first" else t != start[n]:
+                    hit = v[t, n] and np.hypot(*(q[t, n] - p[t, n])) < k
+                    hits, both, wrong = hits + hit, both + (hit and w[t, n]), wrong + (w[t, n] and not hit)
+                    visible, correct, scored = visible + v[t, n], correct + (v[t, n] == w[t, n]), scored + 1
+        within.append(hits / visible if visible else np.nan)
+        jaccard.append(both / (visible + wrong) if visible + wrong else np.nan)
+    expected = {"OA": correct / scored if scored else np.nan, "APD2D": np.mean(within), "AJ2D": np.mean(jaccard)}
+    agrees(t3d.tapvid2d_metrics(p, v, q, w, start, mode), expected, (seed, mode))
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +222,32 @@ def test_evaluate_knows_a_wrong_scale_from_wrong_tracks(clip):
     assert scores["APD3D"] > 0.999 > 0.2 > scores["APD3D_none"]
 
 
+def test_evaluate_takes_another_truth(clip):
+    some = clip.tracks.select(clip.tracks.dynamic)
+    scores = t3d.evaluate(some, clip, truth=some)
+    assert scores["AJ3D"] == scores["AJ3D_dynamic"] == 1 and np.isnan(scores["AJ3D_static"])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_evaluate_counts_what_is_not_finite_as_a_miss(clip, bad):
+    xyz = clip.tracks.xyz.copy()
+    xyz[np.where(clip.tracks.visible)[0][0], np.where(clip.tracks.visible)[1][0]] = bad
+    scores = t3d.evaluate(t3d.Tracks(xyz, clip.tracks.visible, clip.queries), clip)
+    assert scores["APD3D_none"] == pytest.approx(1 - 1 / clip.tracks.visible.sum())
+
+
+def test_subsets_share_the_scale_of_the_whole_clip(clip):
+    # Static points are 1.1 times too far, moving ones right: scales of their own would clear both.
+    centre = t3d.geometry.invert(clip.extrinsics)[:, None, :3, 3]
+    factor = np.where(clip.tracks.dynamic, 1, 1.1)[None, :, None].astype(np.float32)
+    xyz = centre + factor * (clip.tracks.xyz - centre)
+    scores = t3d.evaluate(t3d.Tracks(xyz, clip.tracks.visible, clip.queries), clip)
+    assert min(scores["APD3D_dynamic"], scores["APD3D_static"]) < 0.9
+
+
 def test_evaluate_refuses_other_queries(clip):
+    with pytest.raises(ValueError, match="pred: expected 8 frames"):
+        t3d.evaluate(clip.cut(0, 7).tracks, clip)
     with pytest.raises(ValueError, match="queries"):
         t3d.evaluate(clip.tracks.select(slice(3)), clip)
     with pytest.raises(ValueError, match="no true tracks"):

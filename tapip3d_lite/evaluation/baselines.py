@@ -20,86 +20,129 @@ from tapip3d_lite.queries import resolve_queries
 class StaticTracker:
     """Nothing moves in the world: every point stays at its query.
 
-    A point counts as visible where it projects inside the image and no surface stands in front of it.
+    A point counts as visible where it projects inside the image and the depth map shows a surface there, neither in
+    front of it (it is hidden) nor behind it (whatever the query lay on has moved away).
 
     Attributes:
         slack: relative depth difference up to which the surface at the pixel still is the point.
     """
 
-    slack: float = 0.05
+    slack: float = 0.02
 
-    def track(self, clip: Clip, queries: np.ndarray | None = None, **_model_only: object) -> Tracks:
-        """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid."""
+    def track(
+        self,
+        clip: Clip,
+        queries: np.ndarray | None = None,
+        space: str | None = None,
+        iterations: int | None = None,
+        support_grid: int = 0,
+        bidirectional: bool = True,
+        depth_roi: str | tuple[float, float] | None = None,
+        visible_threshold: float | None = None,
+        progress: bool = False,
+    ) -> Tracks:
+        """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid; the rest changes nothing."""
         queries = resolve_queries(clip, queries)
         xyz = np.repeat(queries[None, :, 1:], len(clip), 0)
         uv, z = project(xyz, clip.intrinsics, clip.extrinsics)
         surface, inside = _depth_at(clip, uv)
-        free = (surface == 0) | (z <= surface * (1 + self.slack))
-        return Tracks(xyz, inside & (z > 0) & free, queries)
+        return Tracks(xyz, inside & (z > 0) & (np.abs(z - surface) <= self.slack * z), queries)
 
 
 @dataclass(frozen=True)
 class KltTracker:
     """OpenCV's pyramidal Lucas-Kanade in the image, lifted by depth, with a forward-backward check for visibility.
 
-    From its query frame each point is followed forward and backward in time, frame by frame. A point is lost where
-    the way back misses its start by more than `tolerance`, where it leaves the image, or where its depth jumps.
-    Between two visible frames the path is interpolated in 3D; before the first and after the last it stays put.
+    From its query frame each point is followed forward and backward in time, frame by frame. The search starts where
+    the point would be if it had stood still in the world since it was last seen. It is lost where the way back misses
+    its start by more than `tolerance`, where it leaves the image, or where the depth found is another surface's. A
+    lost point is looked for again in every later frame. Between two visible frames the path is interpolated in 3D;
+    before the first and after the last the point stays put.
 
     Attributes:
         window: side of the Lucas-Kanade window in pixels.
         levels: pyramid levels above the image.
         tolerance: largest forward-backward error in pixels.
-        jump: largest relative change of depth from frame to frame.
+        jump: largest relative change of depth, apart from the camera's motion, since the point was last seen.
     """
 
     window: int = 9
-    levels: int = 3
-    tolerance: float = 1.5
+    levels: int = 2
+    tolerance: float = 1.0
     jump: float = 0.1
 
-    def track(self, clip: Clip, queries: np.ndarray | None = None, **_model_only: object) -> Tracks:
-        """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid."""
-        queries = resolve_queries(clip, queries)
-        start = queries[:, 0].astype(int)
-        gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in clip.video]
-        uv = np.zeros((len(clip), len(queries), 2), np.float32)
-        z = np.zeros((len(clip), len(queries)), np.float32)
-        alive = np.zeros(z.shape, bool)
-        first_uv, first_z = project(queries[:, None, 1:], clip.intrinsics[start], clip.extrinsics[start])
-        own = np.arange(len(queries))
-        uv[start, own], z[start, own], alive[start, own] = first_uv[:, 0], first_z[:, 0], True
-        for step, frames in ((1, range(len(clip) - 1)), (-1, range(len(clip) - 1, 0, -1))):
-            for t in frames:
-                begun = start <= t if step == 1 else start >= t
-                self._advance(clip, gray, t, t + step, np.flatnonzero(alive[t] & begun), uv, z, alive)
-        world = unproject(uv, z, clip.intrinsics, clip.extrinsics)
-        world[start, own] = queries[:, 1:]
-        return Tracks(_filled(world, alive), alive, queries)
-
-    def _advance(
+    def track(
         self,
         clip: Clip,
-        gray: list,
-        t: int,
-        s: int,
-        which: np.ndarray,
-        uv: np.ndarray,
-        z: np.ndarray,
-        alive: np.ndarray,
-    ) -> None:
-        """Follow the points `which` from frame t to its neighbour s, and mark those that arrive."""
-        if not len(which):
-            return
-        options = {"winSize": (self.window, self.window), "maxLevel": self.levels}
-        here = np.ascontiguousarray(uv[t, which])
-        there, found, _ = cv2.calcOpticalFlowPyrLK(gray[t], gray[s], here, None, **options)
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(gray[s], gray[t], there, None, **options)
-        depth, inside = _steadiest_depth(clip, s, there, z[t, which])
-        steady = np.abs(depth - z[t, which]) <= self.jump * z[t, which]
+        queries: np.ndarray | None = None,
+        space: str | None = None,
+        iterations: int | None = None,
+        support_grid: int = 0,
+        bidirectional: bool = True,
+        depth_roi: str | tuple[float, float] | None = None,
+        visible_threshold: float | None = None,
+        progress: bool = False,
+    ) -> Tracks:
+        """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid.
+
+        With `bidirectional=False` a point stands still and counts as hidden before its query; the rest of the
+        options changes nothing.
+        """
+        paths = _Paths(clip, resolve_queries(clip, queries))
+        for step in (1, -1) if bidirectional else (1,):
+            last = paths.start.copy()  # (N,) the frame where each point was last seen in this direction
+            for t in range(len(clip))[::step][1:]:
+                self._advance(paths, t, last, step * (t - paths.start) > 0)
+        return Tracks(_filled(paths.world, paths.seen), paths.seen, paths.queries)
+
+    def _advance(self, paths: _Paths, t: int, last: np.ndarray, begun: np.ndarray) -> None:
+        """Look in frame t for all points (N,) whose query frame lies behind, from where each was `last` seen."""
+        camera = paths.clip.intrinsics[t], paths.clip.extrinsics[t]
+        still, z = project(paths.world[last, np.arange(len(last))], *camera)
+        surface, inside = _nearest_depth(paths.clip, t, still, z)
+        # A point that was lost can be back only where a surface is at its depth; one just seen may have moved off.
+        possible = begun & (z > 0) & ((last == t - 1) | (last == t + 1) | (inside & self._same(surface, z)))
+        for origin in np.unique(last[possible]):
+            which = np.flatnonzero(possible & (last == origin))
+            there, returned = self._flow(paths, origin, t, which, still[which])
+            depth, inside = _nearest_depth(paths.clip, t, there, z[which])
+            kept = returned & inside & self._same(depth, z[which])
+            if abs(origin - t) > 1:  # after a gap only a small correction is trusted: the best match may be a stranger
+                kept &= np.linalg.norm(there - still[which], axis=-1) <= 2 * self.tolerance
+            found = which[kept]
+            paths.uv[t, found], paths.seen[t, found], last[found] = there[kept], True, t
+            paths.world[t, found] = unproject(there[kept], depth[kept], *camera)
+
+    def _flow(self, paths: _Paths, a: int, b: int, which: np.ndarray, guess: np.ndarray) -> tuple:
+        """Pixels (n, 2) in frame b of the points `which` of frame a, and whether (n,) the way back returns."""
+        options = {
+            "winSize": (self.window, self.window),
+            "maxLevel": self.levels,
+            "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        }
+        here, guess = paths.uv[a, which], guess.astype(np.float32)
+        there, out, _ = cv2.calcOpticalFlowPyrLK(paths.gray[a], paths.gray[b], here, guess.copy(), **options)
+        # The way back starts off by as much as the way there ended off its guess, so that it proves something.
+        back, home, _ = cv2.calcOpticalFlowPyrLK(paths.gray[b], paths.gray[a], there, here + (there - guess), **options)
         returned = np.linalg.norm(back - here, axis=-1) <= self.tolerance
-        kept = (found[:, 0] & found_back[:, 0]).astype(bool) & returned & inside & steady
-        uv[s, which[kept]], z[s, which[kept]], alive[s, which[kept]] = there[kept], depth[kept], True
+        return there, out[:, 0].astype(bool) & home[:, 0].astype(bool) & returned
+
+    def _same(self, depth: np.ndarray, expected: np.ndarray) -> np.ndarray:
+        return np.abs(depth - expected) <= self.jump * expected
+
+
+class _Paths:
+    """What is known so far: pixels `uv` (T, N, 2), `world` (T, N, 3) and `seen` (T, N), from the queries outward."""
+
+    def __init__(self, clip: Clip, queries: np.ndarray) -> None:
+        shape = len(clip), len(queries)
+        self.clip, self.queries, self.start = clip, queries, queries[:, 0].astype(int)
+        self.gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in clip.video]
+        self.uv, self.world = np.zeros((*shape, 2), np.float32), np.zeros((*shape, 3), np.float32)
+        self.seen = np.zeros(shape, bool)
+        at = self.start, np.arange(len(queries))
+        uv, _ = project(queries[:, None, 1:], clip.intrinsics[self.start], clip.extrinsics[self.start])
+        self.uv[at], self.world[at], self.seen[at] = uv[:, 0], queries[:, 1:], True
 
 
 def _depth_at(clip: Clip, uv: np.ndarray, frames: list[int] | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -112,15 +155,16 @@ def _depth_at(clip: Clip, uv: np.ndarray, frames: list[int] | None = None) -> tu
     return np.where(inside, clip.depths[t[:, None], v, u], 0), inside
 
 
-def _steadiest_depth(clip: Clip, frame: int, uv: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the 3 x 3 depths around each pixel (N, 2) the one nearest to `before` (N,): at a silhouette the nearest
-    pixel often belongs to what lies behind.
+def _nearest_depth(clip: Clip, frame: int, uv: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the 3 x 3 depths around each pixel (N, 2) the one nearest to `expected` (N,), and whether the pixel is inside.
+
+    At a silhouette the pixel itself often belongs to what lies behind.
     """
     steps = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(9, 1, 2)
     _, inside = _depth_at(clip, uv[None], frames=[frame])
     around = np.concatenate([_depth_at(clip, (uv + step)[None], frames=[frame])[0] for step in steps])
     around = np.where(around > 0, around, np.inf)
-    best = np.abs(around - before).argmin(0)
+    best = np.abs(around - expected).argmin(0)
     return around[best, np.arange(len(uv))], inside[0]
 
 

@@ -13,7 +13,7 @@ from tapip3d_lite.geometry import project, transform
 RASTER = 256  # both benchmarks measure pixels on an image of this size
 
 
-def evaluate(pred: Tracks, clip: Clip) -> dict[str, float]:
+def evaluate(pred: Tracks, clip: Clip, truth: Tracks | None = None) -> dict[str, float]:
     """Scores of predicted tracks on a clip with truth.
 
     3D scores follow TAPVid-3D: camera frame, intrinsics scaled by 256 / min(H, W), all frames. `AJ3D` and `APD3D` use
@@ -22,8 +22,9 @@ def evaluate(pred: Tracks, clip: Clip) -> dict[str, float]:
     `_dynamic` and `_static` variants score these alone, with the scale of the whole clip.
 
     Args:
-        pred: tracks of the clip's own queries, in their order.
-        clip: with `tracks`.
+        pred: tracks of the truth's queries, in their order.
+        clip: gives the cameras, and the truth where none is given.
+        truth: in place of `clip.tracks`, e.g. `clip.tracks.select(mask)`.
 
     Returns:
         `AJ3D, APD3D, OA, AJ2D, APD2D, AJ3D_none, APD3D_none, EPE` (mean 3D error over visible truth, scene units) and
@@ -32,16 +33,22 @@ def evaluate(pred: Tracks, clip: Clip) -> dict[str, float]:
     Raises:
         ValueError: the clip has no truth, or the prediction follows other queries.
     """
-    truth = clip.tracks
+    truth = clip.tracks if truth is None else truth
     if truth is None:
         raise ValueError(f"evaluate: clip {clip.name!r} has no true tracks; simulate one or load a file with tracks")
+    for name, tracks in (("truth", truth), ("pred", pred)):
+        if len(tracks.xyz) != len(clip):
+            raise ValueError(
+                f"{name}: expected {len(clip)} frames as in the clip, got {len(tracks.xyz)}; cut both alike"
+            )
     if pred.queries.shape != truth.queries.shape or not np.allclose(pred.queries, truth.queries, atol=1e-4):
         raise ValueError(
             f"evaluate: the prediction follows {pred.queries.shape[0]} queries that are not the {truth.queries.shape[0]} "
-            "of clip.tracks; call track(clip) without queries"
+            "of the truth; call track(clip) without queries"
         )
-    p, q = transform(truth.xyz, clip.extrinsics), transform(pred.xyz, clip.extrinsics)
-    factor = scale_factor(p.astype(np.float64), q.astype(np.float64), truth.visible & pred.visible, None, "median")
+    with np.errstate(invalid="ignore"):  # a prediction that is not finite is a miss, not a reason to stop
+        p, q = (transform(tracks.xyz.astype(np.float64), clip.extrinsics) for tracks in (truth, pred))
+    factor = scale_factor(p, q, truth.visible & pred.visible, None, "median")
     scores = _scores(clip, truth, pred, p, q, factor)
     if truth.dynamic is not None:
         for name, mask in (("dynamic", truth.dynamic), ("static", ~truth.dynamic)):
@@ -56,9 +63,10 @@ def _scores(clip: Clip, truth: Tracks, pred: Tracks, p: np.ndarray, q: np.ndarra
     scaled = tapvid3d_metrics(p, truth.visible, factor * q, pred.visible, intrinsics, scaling="none")
     plain = tapvid3d_metrics(p, truth.visible, q, pred.visible, intrinsics, scaling="none")
     raster = np.array([RASTER / width, RASTER / height])
-    true_uv, uv = (project(x, clip.intrinsics)[0] * raster for x in (p, q))
+    with np.errstate(invalid="ignore"):
+        true_uv, uv = (project(x, clip.intrinsics)[0] * raster for x in (p, q))
+        error = np.linalg.norm(p - q, axis=-1)[truth.visible]
     flat = tapvid2d_metrics(true_uv, truth.visible, uv, pred.visible, truth.queries, mode="strided")
-    error = np.linalg.norm(p - q, axis=-1)[truth.visible]
     return {
         **{name: scaled[name] for name in ("AJ3D", "APD3D", "OA")},
         **{name: flat[name] for name in ("AJ2D", "APD2D")},
@@ -77,7 +85,10 @@ def mean_scores(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
 def score_table(
     rows: Mapping[str, Mapping[str, float]], metrics: Sequence[str] = ("AJ3D", "APD3D", "OA", "AJ3D_none", "APD3D_none")
 ) -> str:
-    """A Markdown table, one row an entry, three decimals."""
+    """A Markdown table, one row an entry, three decimals, nan where an entry lacks a metric."""
     lines = ["| | " + " | ".join(metrics) + " |", "|---" * (len(metrics) + 1) + "|"]
-    lines += [f"| {name} | " + " | ".join(f"{row[m]:.3f}" for m in metrics) + " |" for name, row in rows.items()]
+    lines += [
+        f"| {name} | " + " | ".join(f"{row.get(m, float('nan')):.3f}" for m in metrics) + " |"
+        for name, row in rows.items()
+    ]
     return "\n".join(lines)

@@ -13,6 +13,8 @@ with V true and W predicted visibility. AJ and APD are means over k. Source: Kop
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 Array = np.ndarray
@@ -55,7 +57,11 @@ def tapvid3d_metrics(
     focal = np.asarray(intrinsics, np.float64)
     if focal.shape[-2:] != (3, 3) or focal.ndim not in (2, 3) or (focal.ndim == 3 and len(focal) != len(p)):
         raise ValueError(f"intrinsics: expected ({len(p)}, 3, 3) or (3, 3), got {focal.shape}")
-    scale = scale_factor(p, q, v & w, _query_frames(queries, p.shape[1]), scaling)
+    if not (focal[..., [0, 1], [0, 1]] > 0).all():
+        raise ValueError(
+            "intrinsics: expected positive fx and fy in pixels; give K as [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+        )
+    scale = scale_factor(p, q, v & w, _query_frames(queries, p.shape[:2]), scaling)
     pixel = p[..., 2] / np.sqrt(focal[..., 0, 0] * focal[..., 1, 1])[..., None]
     with np.errstate(invalid="ignore", over="ignore"):
         squared = ((scale * q - p) ** 2).sum(-1)
@@ -93,7 +99,9 @@ def tapvid2d_metrics(
     v, w = _checked(p, gt_visible, q, visible, 2)
     if mode not in MODES:
         raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
-    t, start = np.arange(len(p))[:, None], _query_frames(queries, p.shape[1])[None]
+    t, start = np.arange(len(p))[:, None], _query_frames(queries, p.shape[:2])
+    if start is None:
+        raise ValueError("queries: the 2D metrics leave out frames by the query's; pass queries=(N, 3) or (N,)")
     scored = t > start if mode == "first" else t != start
     with np.errstate(invalid="ignore", over="ignore"):
         squared = ((q - p) ** 2).sum(-1)
@@ -155,22 +163,24 @@ def _ratio(numerator: Array, denominator: Array) -> Array:
         return np.where(denominator > 0, numerator / np.maximum(denominator, 1), np.nan)
 
 
-def _norm_ratio(p: Array, q: Array, where: Array, average: object) -> float:
+def _norm_ratio(p: Array, q: Array, where: Array, average: Callable[[Array], float]) -> float:
     """Average |p| / average |q|, or NaN without a common visible point, which makes every point a miss."""
-    if not where.any():
-        return np.nan
     with np.errstate(invalid="ignore", over="ignore"):
-        true, predicted = (np.maximum(np.linalg.norm(x[where], axis=-1), 1e-6) for x in (p, q))
-    return float(average(true) / average(predicted))
+        norms = [np.maximum(np.linalg.norm(x[where], axis=-1), 1e-6) for x in (p, q)]
+        if any(np.isnan(norm).all() for norm in norms):  # also where there is none
+            return np.nan
+        return float(average(norms[0]) / average(norms[1]))
 
 
-def _query_frames(queries: Array | None, count: int) -> Array | None:
+def _query_frames(queries: Array | None, shape: tuple[int, int]) -> Array | None:
     if queries is None:
         return None
     frames = np.asarray(queries)
-    frames = frames if frames.ndim == 1 else frames[:, 0]
-    if frames.shape != (count,):
-        raise ValueError(f"queries: expected {count} rows (t, ...) as there are tracks, got {np.shape(queries)}")
+    frames = frames[:, 0] if frames.ndim == 2 and frames.shape[1] else frames
+    if frames.shape != shape[1:] or frames.dtype.kind not in "iuf":
+        raise ValueError(f"queries: expected {shape[1]} rows (t, ...) as there are tracks, got {np.shape(queries)}")
+    if not ((frames >= 0) & (frames < shape[0]) & (frames == np.rint(frames))).all():
+        raise ValueError(f"queries: expected whole frames in [0, {shape[0] - 1}], got {frames}; the order is (t, ...)")
     return frames.astype(int)
 
 
