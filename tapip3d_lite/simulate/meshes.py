@@ -65,7 +65,8 @@ def blob(rng: np.random.Generator) -> Mesh:
     height = np.cos(np.linspace(np.pi, 0, 17)[1:-1])
     vertices, faces = _revolve(height, np.sqrt(1 - height**2), 20, poles=(-1.0, 1.0))
     waves, phases = rng.normal(size=(4, 3)) * 1.6, rng.uniform(0, 2 * np.pi, 4)
-    return vertices * (0.82 + 0.075 * np.sin(vertices @ waves.T + phases).sum(-1, keepdims=True)), faces
+    bumps = 0.82 + 0.075 * np.sin(vertices @ waves.T + phases).sum(-1, keepdims=True)
+    return _oriented(vertices * bumps, faces)
 
 
 MESHES: dict[str, Callable[[np.random.Generator], Mesh]] = {
