@@ -93,13 +93,60 @@ def test_notebook_bundle_has_a_static_twin(clip):
     shown = t3d.figures.show_3d(
         t3d.figures.tracks_3d(clip, clip.tracks, points=200), t3d.figures.tracks_3d_static(clip, clip.tracks)
     )
-    bundle = shown._repr_mimebundle_()
-    assert len(bundle["application/vnd.plotly.v1+json"]["frames"]) == 5
-    cloud = bundle["application/vnd.plotly.v1+json"]["data"][0]
+    scene, twin = shown.bundles()
+    assert "image/png" not in scene, "JupyterLab would show the PNG instead of the scene"
+    assert len(scene["application/vnd.plotly.v1+json"]["frames"]) == 5 and "5 frames" in scene["text/plain"]
+    cloud = scene["application/vnd.plotly.v1+json"]["data"][0]
     assert len(unpack(cloud["x"])) == 200
-    with Image.open(io.BytesIO(bundle["image/png"])) as picture:
+    with Image.open(io.BytesIO(twin["image/png"])) as picture:
         assert picture.size[0] > 300
-    assert "5 frames" in bundle["text/plain"]
+
+
+def test_cloud_codes_stand_for_the_pixels_colours(clip):
+    figure = t3d.figures.tracks_3d(clip, clip.tracks, points=10**6)
+    scale = [re.findall(r"\d+", color) for _, color in figure.layout.coloraxis.colorscale]
+    drawn = np.array(scale, int)[np.asarray(figure.frames[2].data[0].marker.color)]
+    cloud = figure.frames[2].data[0]
+    uv, z = t3d.geometry.project(np.stack([cloud.x, cloud.y, cloud.z], -1), clip.intrinsics[2], clip.extrinsics[2])
+    u, v = np.rint(uv).astype(int).T
+    np.testing.assert_allclose(z, clip.depths[2, v, u], rtol=1e-4)
+    assert np.abs(drawn - clip.video[2, v, u]).max() <= 255 / 12
+
+
+def test_scene_opens_behind_the_first_camera(clip):
+    camera = t3d.figures.tracks_3d(clip, clip.tracks, points=100).layout.scene.camera
+    rotation = clip.extrinsics[0, :3, :3]
+    np.testing.assert_allclose([camera.up.x, camera.up.y, camera.up.z], -rotation[1], atol=1e-6)
+    view = np.array([camera.center[k] - camera.eye[k] for k in "xyz"])
+    assert view @ rotation[2] > 0.8 * np.linalg.norm(view)
+
+
+def test_many_tracks_no_tracks_and_tracks_of_another_clip(clip):
+    many = clip.tracks.select(np.arange(400) % clip.tracks.xyz.shape[1])
+    tails = t3d.figures.tracks_3d(clip, many, points=10, max_tracks=400).frames[1].data[1]
+    assert tails.line.color.max() == len(set(tails.line.color.tolist())) - 1 > 255
+    for most in (1, 7, 39):
+        heads = t3d.figures.tracks_3d(clip, clip.tracks, points=10, max_tracks=most).frames[0].data[2]
+        assert 1 <= len(heads.x) <= most
+    none = clip.tracks.select(slice(0, 0))
+    assert len(t3d.figures.tracks_3d(clip, none, points=10).frames) == 5
+    for draw in (t3d.figures.tracks_3d_static, t3d.figures.overview):
+        assert len(png_bytes(draw(clip, none))) > 1000
+    short = replace(clip.tracks, xyz=clip.tracks.xyz[:3], visible=clip.tracks.visible[:3], visible_logits=None)
+    for draw in (t3d.figures.tracks_3d, t3d.figures.tracks_3d_static, t3d.figures.overview):
+        with pytest.raises(ValueError, match=r"tracks: expected 5 frames .* got 3"):
+            draw(clip, short)
+    with pytest.raises(ValueError, match=r"frame: expected 0 to 4 .* got 5"):
+        t3d.figures.frame_with_tracks(clip, clip.tracks, 5)
+    with pytest.raises(ValueError, match=r"frame: expected 0 to 4 .* got -1"):
+        t3d.figures.depth_map(clip, -1)
+
+
+def test_depth_map_of_a_frame_without_depth_is_all_grey(clip):
+    depths = clip.depths.copy()
+    depths[1] = 0
+    figure = t3d.figures.depth_map(replace(clip, depths=depths, queries=None, tracks=None), 1)
+    assert figure.axes[0].images[0].get_array().mask.all() and len(png_bytes(figure)) > 1000
 
 
 def test_sheets_bars_and_curves(clip):

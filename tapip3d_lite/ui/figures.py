@@ -12,6 +12,7 @@ from pathlib import Path
 
 import plotly.graph_objects as go
 from IPython import get_ipython
+from IPython.display import display
 from matplotlib.figure import Figure
 
 from tapip3d_lite.files import atomic_path
@@ -43,7 +44,10 @@ __all__ = [
 
 
 class show_3d:
-    """A 3D figure for a notebook cell: interactive where plotly runs, its PNG twin everywhere else.
+    """A 3D figure for a notebook cell: the interactive scene, then its PNG twin for viewers without JavaScript.
+
+    They are two outputs of the cell because JupyterLab, offered both in one, shows the PNG. The scene needs no network:
+    plotly installs a JupyterLab extension that draws it.
 
     Args:
         figure: the plotly figure.
@@ -53,12 +57,15 @@ class show_3d:
     def __init__(self, figure: go.Figure, twin: Figure) -> None:
         self.figure, self.twin = figure, twin
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, object]:
-        return {
-            "application/vnd.plotly.v1+json": json.loads(self.figure.to_json()),
-            "image/png": png_bytes(self.twin),
-            "text/plain": f"3D figure with {len(self.figure.frames)} frames; its static twin is the PNG",
-        }
+    def bundles(self) -> list[dict[str, object]]:
+        """The two outputs, each as MIME type to content."""
+        note = f"3D scene with {len(self.figure.frames)} frames: run the cell in JupyterLab to turn it"
+        scene = {"application/vnd.plotly.v1+json": json.loads(self.figure.to_json()), "text/plain": note}
+        return [scene, {"image/png": png_bytes(self.twin), "text/plain": "the static twin"}]
+
+    def _ipython_display_(self) -> None:
+        for bundle in self.bundles():
+            display(bundle, raw=True)
 
 
 def png_bytes(figure: Figure, dpi: int = 90) -> bytes:

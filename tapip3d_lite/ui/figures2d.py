@@ -8,6 +8,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project
@@ -21,7 +22,22 @@ def track_colors(clip: Clip, tracks: Tracks) -> np.ndarray:
     uv, _ = project(tracks.queries[:, None, 1:], clip.intrinsics[t], clip.extrinsics[t])
     height, width = clip.size
     place = (uv[:, 0, 0] / width + uv[:, 0, 1] / height) / 2
-    return matplotlib.colormaps["turbo"](np.clip(place, 0.03, 0.97))[:, :3]
+    # Most queries lie around the middle of the image: the steeper slope spends the rainbow on them.
+    return matplotlib.colormaps["turbo"](np.clip(0.5 + 1.7 * (place - 0.5), 0.04, 0.96))[:, :3]
+
+
+def check_drawable(clip: Clip, tracks: Tracks | None = None, frame: int = 0) -> None:
+    """Refuse a frame outside the clip, or tracks of another length, before a figure fails on them.
+
+    Raises:
+        ValueError: such a frame or such tracks.
+    """
+    if not 0 <= frame < len(clip):
+        raise ValueError(f"frame: expected 0 to {len(clip) - 1} (clip {clip.name!r}), got {frame}; choose another")
+    if tracks is not None and len(tracks.xyz) != len(clip):
+        raise ValueError(
+            f"tracks: expected {len(clip)} frames as in clip {clip.name!r}, got {len(tracks.xyz)}; cut both alike"
+        )
 
 
 def frame_with_tracks(
@@ -37,6 +53,7 @@ def frame_with_tracks(
         truth: true tracks of the same queries; a white line then joins each estimate with the truth.
         ax: axes to draw into, else a new figure.
     """
+    check_drawable(clip, tracks, frame)
     ax = ax or _axes(clip)
     _image(ax, clip.video[frame], f"{clip.name} · frame {frame}")
     start = max(0, frame - tail)
@@ -58,16 +75,12 @@ def frame_with_tracks(
 
 def depth_map(clip: Clip, frame: int, ax: Axes | None = None) -> Figure:
     """Depth of one frame with a colour bar in scene units; pixels without depth are grey."""
+    check_drawable(clip, frame=frame)
     ax = ax or _axes(clip, extra=0.9)
     depth = clip.depths[frame]
-    shown = np.ma.masked_equal(depth, 0)
-    cmap = matplotlib.colormaps["viridis_r"].with_extremes(bad="#b8b8b8")
-    high = np.quantile(depth[depth > 0], 0.99) if depth.any() else 1.0
-    image = ax.imshow(shown, cmap=cmap, vmax=high)
+    image = _depth(ax, depth, np.quantile(depth[depth > 0], [0, 0.99]) if depth.any() else (0, 1))
     _frame(ax, f"{clip.name} · depth, frame {frame}")
-    bar = ax.figure.colorbar(image, ax=ax, fraction=0.046, pad=0.03, extend="max")
-    bar.set_label("z-depth (scene units)", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
+    _depth_bar(ax.figure, image, [ax])
     return ax.figure
 
 
@@ -130,14 +143,27 @@ def scores_bar(scores: Mapping[str, Mapping[str, float]], metrics: Sequence[str]
 def overview(clip: Clip, tracks: Tracks, columns: int = 4) -> Figure:
     """The picture of a result: frames with tracks above, their depth below."""
     height, width = clip.size
-    figure = _figure(2.6 * columns, 2 * 2.6 * height / width + 0.4)
-    for i, t in enumerate(np.linspace(0, len(clip) - 1, columns).astype(int)):
-        frame_with_tracks(clip, tracks, t, ax=figure.add_subplot(2, columns, i + 1))
-        ax = figure.add_subplot(2, columns, columns + i + 1)
-        depth = np.ma.masked_equal(clip.depths[t], 0)
-        ax.imshow(depth, cmap="viridis_r", vmax=np.quantile(clip.depths[clip.depths > 0], 0.99))
-        _frame(ax, "depth" if i == 0 else "")
+    check_drawable(clip, tracks)
+    figure = _figure(2.6 * columns + 0.6, 2 * 2.6 * height / width + 0.3)
+    axes = figure.subplots(2, columns, squeeze=False)
+    limits = np.quantile(clip.depths[clip.depths > 0], [0, 0.99])
+    for (above, below), t in zip(axes.T, np.linspace(0, len(clip) - 1, columns).astype(int), strict=True):
+        frame_with_tracks(clip, tracks, t, ax=above)
+        image = _depth(below, clip.depths[t], limits)
+        _frame(below, "")
+    _depth_bar(figure, image, list(axes[1]))
     return figure
+
+
+def _depth(ax: Axes, depth: np.ndarray, limits: Sequence[float]) -> AxesImage:
+    cmap = matplotlib.colormaps["viridis_r"].with_extremes(bad="#b8b8b8")
+    return ax.imshow(np.ma.masked_equal(depth, 0), cmap=cmap, vmin=limits[0], vmax=limits[1])
+
+
+def _depth_bar(figure: Figure, image: AxesImage, axes: list[Axes]) -> None:
+    bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02, extend="max")
+    bar.set_label("z-depth (scene units)", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
 
 
 def _figure(width: float, height: float) -> Figure:

@@ -11,13 +11,13 @@ from matplotlib.figure import Figure
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import invert, transform, unproject
-from tapip3d_lite.ui.figures2d import track_colors
+from tapip3d_lite.ui.figures2d import check_drawable, track_colors
 
-_LEVELS = 6  # colour levels per channel: a code into 216 colours costs a byte a point, an RGB string twenty
+_LEVELS = 12  # colour levels per channel: a code into 1728 colours costs two bytes a point, an RGB string twenty
 
 
 def tracks_3d(
-    clip: Clip, tracks: Tracks, points: int = 1500, max_tracks: int = 120, tail: int = 8, title: str | None = None
+    clip: Clip, tracks: Tracks, points: int = 2500, max_tracks: int = 120, tail: int = 8, title: str | None = None
 ) -> go.Figure:
     """Point cloud and tracks in world coordinates with a time slider and a play button.
 
@@ -26,11 +26,12 @@ def tracks_3d(
     Args:
         clip: the clip.
         tracks: what to draw, world frame.
-        points: cloud points per frame (the file grows by about 17 bytes a point and frame).
+        points: cloud points per frame (the page grows by about 19 bytes a point and frame).
         max_tracks: at most this many tracks are drawn, evenly picked.
         tail: past frames that the tails cover.
         title: above the scene.
     """
+    check_drawable(clip, tracks)
     near = _near(clip)
     tracks = _drawn(clip, tracks, near, max_tracks)
     colors = track_colors(clip, tracks)
@@ -45,8 +46,9 @@ def tracks_3d(
         scene=_scene(clip, tracks, near),
         coloraxis=_cloud_colors(),
         coloraxis2={"colorscale": _color_scale(colors), "cmin": 0, "cmax": max(len(colors) - 1, 1), "showscale": False},
-        margin={"l": 0, "r": 0, "t": 36, "b": 0},
-        height=520,
+        title_font_size=14,
+        margin={"l": 0, "r": 0, "t": 34, "b": 30},
+        height=560,
         showlegend=False,
         uirevision="keep",  # the reader's view survives every redraw
         updatemenus=[_play_button()],
@@ -55,7 +57,7 @@ def tracks_3d(
     return figure
 
 
-def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = None, points: int = 2500) -> Figure:
+def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = None, points: int = 4000) -> Figure:
     """The matplotlib twin of `tracks_3d`: the scene at a few instants, from above the first camera.
 
     Args:
@@ -65,6 +67,8 @@ def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = 
         points: cloud points per panel.
     """
     frames = [0, len(clip) // 2, len(clip) - 1] if frames is None else list(frames)
+    for t in frames:
+        check_drawable(clip, tracks, t)
     near = _near(clip)
     tracks = _drawn(clip, tracks, near, 120)
     colors = track_colors(clip, tracks)
@@ -79,10 +83,13 @@ def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = 
         path = transform(tracks.xyz[max(0, t - 12) : t + 1], upright)
         for n in range(path.shape[1]):
             ax.plot(path[:, n, 0], path[:, n, 2], -path[:, n, 1], color=colors[n], lw=1)
+        x, y, z = path[-1].T
+        seen = tracks.visible[t]
+        ax.scatter(x, z, -y, s=9, facecolors=np.where(seen[:, None], colors, 1), edgecolors=colors, depthshade=False)
         ax.set_xlim(limits[0])
         ax.set_ylim(limits[2])
         ax.set_zlim(-limits[1][1], -limits[1][0])
-        ax.set_box_aspect([np.ptp(limits[k]) for k in (0, 2, 1)], zoom=1.3)
+        ax.set_box_aspect([np.ptp(limits[k]) for k in (0, 2, 1)], zoom=1.42)
         ax.view_init(elev=22, azim=-75)
         ax.set_title(f"t = {t}", fontsize=8)
         ax.set(xticklabels=[], yticklabels=[], zticklabels=[])
@@ -99,7 +106,7 @@ def _drawn(clip: Clip, tracks: Tracks, near: float, most: int) -> Tracks:
     t = tracks.queries[:, 0].astype(int)
     z = transform(tracks.queries[:, None, 1:], clip.extrinsics[t])[:, 0, 2]
     inside = np.flatnonzero(z <= near) if (z <= near).any() else np.arange(len(z))
-    return tracks.select(inside[np.unique(np.linspace(0, len(inside) - 1, most).astype(int))])
+    return tracks.select(inside[:: max(1, -(-len(inside) // most))])
 
 
 def _cloud_points(clip: Clip, frame: int, points: int, near: float) -> tuple[np.ndarray, np.ndarray]:
@@ -114,7 +121,7 @@ def _cloud_points(clip: Clip, frame: int, points: int, near: float) -> tuple[np.
 def _cloud(clip: Clip, frame: int, points: int, near: float) -> dict[str, object]:
     xyz, rgb = _cloud_points(clip, frame, points, near)
     level = (rgb.astype(int) * _LEVELS) // 256
-    code = (level @ [_LEVELS**2, _LEVELS, 1]).astype(np.uint8)
+    code = (level @ [_LEVELS**2, _LEVELS, 1]).astype(np.uint16)
     x, y, z = xyz.astype(np.float32).T
     return {"x": x, "y": y, "z": z, "marker": {"color": code}}
 
@@ -123,7 +130,7 @@ def _tails(tracks: Tracks, frame: int, tail: int) -> dict[str, object]:
     path = tracks.xyz[max(0, frame - tail) : frame + 1]
     gap = np.full((1, path.shape[1], 3), np.nan, np.float32)  # NaN lifts the pen between tracks
     x, y, z = np.concatenate([path, gap]).transpose(2, 1, 0).reshape(3, -1)
-    index = np.repeat(np.arange(path.shape[1], dtype=np.uint8), len(path) + 1)
+    index = np.repeat(np.arange(path.shape[1], dtype=np.uint16), len(path) + 1)
     return {"x": x, "y": y, "z": z, "line": {"color": index}}
 
 
@@ -138,7 +145,7 @@ def _styles(colors: np.ndarray) -> list[dict[str, object]]:
     heads = {"size": 4, "color": [to_hex(c) for c in colors]}
     text = [f"track {n} (hollow: occluded)" for n in range(len(colors))]
     return [
-        {"name": "scene", "mode": "markers", "marker": {"size": 2.2, "coloraxis": "coloraxis"}, "hoverinfo": "skip"},
+        {"name": "scene", "mode": "markers", "marker": {"size": 2.6, "coloraxis": "coloraxis"}, "hoverinfo": "skip"},
         {"name": "tails", "mode": "lines", "line": {"width": 3, "coloraxis": "coloraxis2"}, "hoverinfo": "skip"},
         {"name": "points", "mode": "markers", "marker": heads, "text": text, "hoverinfo": "text"},
     ]
@@ -154,7 +161,7 @@ def _cloud_colors() -> dict[str, object]:
 
 def _color_scale(colors: np.ndarray) -> list:
     last = max(len(colors) - 1, 1)
-    scale = [[n / last, to_hex(c)] for n, c in enumerate(colors)]
+    scale = [[n / last, to_hex(c)] for n, c in enumerate(colors)] or [[0, "#888888"]]
     return scale if len(scale) > 1 else [[0, scale[0][1]], [1, scale[0][1]]]
 
 
@@ -177,7 +184,7 @@ def _camera(clip: Clip, target: np.ndarray, ranges: np.ndarray) -> dict[str, obj
     pose = invert(clip.extrinsics[0])
     up = -pose[:3, 1]
     back = pose[:3, 3] - target
-    eye = target + 1.5 * back + 0.35 * np.linalg.norm(back) * up
+    eye = target + 1.2 * back + 0.3 * np.linalg.norm(back) * up
     # With aspectmode "data" a scene unit is the geometric mean of the three ranges, counted from their middle.
     unit, middle = np.prod(np.ptp(ranges, axis=-1)) ** (1 / 3), ranges.mean(-1)
     vectors = {"up": up, "eye": (eye - middle) / unit, "center": (target - middle) / unit}
@@ -192,7 +199,7 @@ def _slider(frames: int) -> dict[str, object]:
     steps = [
         {"label": str(t), "method": "animate", "args": [[str(t)], _step_args(0, "immediate")]} for t in range(frames)
     ]
-    return {"steps": steps, "currentvalue": {"prefix": "frame "}, "x": 0.12, "len": 0.85, "pad": {"t": 8}}
+    return {"steps": steps, "currentvalue": {"prefix": "frame "}, "x": 0.17, "len": 0.81, "pad": {"t": 4}}
 
 
 def _play_button() -> dict[str, object]:
@@ -201,9 +208,11 @@ def _play_button() -> dict[str, object]:
     return {
         "type": "buttons",
         "buttons": [play, pause],
-        "x": 0.1,
+        "direction": "right",
+        "showactive": False,
+        "x": 0.01,
         "y": 0,
-        "xanchor": "right",
+        "xanchor": "left",
         "yanchor": "top",
-        "pad": {"t": 30},
+        "pad": {"t": 18},
     }
