@@ -47,6 +47,8 @@ def clean(nb):
             if "text" in output:
                 output.text = _PATHS.sub(lambda m: m.group().rsplit("/", 1)[-1], output.text)
             data = output.get("data", {})
+            # A scene of megabytes that no static viewer draws; its note and its PNG twin stay.
+            data.pop("application/vnd.plotly.v1+json", None)
             if "application/vnd.jupyter.widget-view+json" in data:
                 # Widget state is not stored, so a stored view would be an empty box.
                 del data["application/vnd.jupyter.widget-view+json"]

@@ -114,11 +114,16 @@ def test_cloud_codes_stand_for_the_pixels_colours(clip):
 
 
 def test_scene_opens_behind_the_first_camera(clip):
-    camera = t3d.figures.tracks_3d(clip, clip.tracks, points=100).layout.scene.camera
-    rotation = clip.extrinsics[0, :3, :3]
-    np.testing.assert_allclose([camera.up.x, camera.up.y, camera.up.z], -rotation[1], atol=1e-6)
-    view = np.array([camera.center[k] - camera.eye[k] for k in "xyz"])
-    assert view @ rotation[2] > 0.8 * np.linalg.norm(view)
+    back = t3d.geometry.invert(clip.extrinsics[0])
+    local = t3d.geometry.transform(clip.tracks.xyz, clip.extrinsics[0])
+    queries = t3d.geometry.transform(clip.queries[:, 1:], clip.extrinsics[0])
+    own = replace(clip.tracks, xyz=local, queries=np.c_[clip.queries[:, :1], queries])
+    in_camera = replace(clip, extrinsics=clip.extrinsics @ back, tracks=own, queries=None)
+    for shown, up in ((clip, [0, 0, 1]), (in_camera, [0, -1, 0])):
+        camera = t3d.figures.tracks_3d(shown, shown.tracks, points=100).layout.scene.camera
+        np.testing.assert_allclose([camera.up.x, camera.up.y, camera.up.z], up, atol=1e-6)
+        view = np.array([camera.center[k] - camera.eye[k] for k in "xyz"])
+        assert view @ shown.extrinsics[0, 2, :3] > 0.8 * np.linalg.norm(view)
 
 
 def test_many_tracks_no_tracks_and_tracks_of_another_clip(clip):

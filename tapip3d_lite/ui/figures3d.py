@@ -47,7 +47,7 @@ def tracks_3d(
         coloraxis=_cloud_colors(),
         coloraxis2={"colorscale": _color_scale(colors), "cmin": 0, "cmax": max(len(colors) - 1, 1), "showscale": False},
         title_font_size=14,
-        margin={"l": 0, "r": 0, "t": 34, "b": 30},
+        margin={"l": 0, "r": 0, "t": 34, "b": 0},
         height=560,
         showlegend=False,
         uirevision="keep",  # the reader's view survives every redraw
@@ -72,8 +72,8 @@ def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = 
     near = _near(clip)
     tracks = _drawn(clip, tracks, near, 120)
     colors = track_colors(clip, tracks)
-    figure = Figure(figsize=(3.4 * len(frames), 2.9), layout="constrained")
-    upright = clip.extrinsics[0]
+    figure = Figure(figsize=(3.4 * len(frames), 2.6), layout="constrained")
+    upright = _upright(clip)
     limits = _limits(transform(np.concatenate([_cloud_points(clip, t, 800, near)[0] for t in frames]), upright))
     for i, t in enumerate(frames):
         ax = figure.add_subplot(1, len(frames), i + 1, projection="3d", computed_zorder=False)
@@ -89,8 +89,8 @@ def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = 
         ax.set_xlim(limits[0])
         ax.set_ylim(limits[2])
         ax.set_zlim(-limits[1][1], -limits[1][0])
-        ax.set_box_aspect([np.ptp(limits[k]) for k in (0, 2, 1)], zoom=1.42)
-        ax.view_init(elev=22, azim=-75)
+        ax.set_box_aspect([np.ptp(limits[k]) for k in (0, 2, 1)], zoom=1.6)
+        ax.view_init(elev=32, azim=-75)
         ax.set_title(f"t = {t}", fontsize=8)
         ax.set(xticklabels=[], yticklabels=[], zticklabels=[])
     return figure
@@ -182,13 +182,29 @@ def _scene(clip: Clip, tracks: Tracks, near: float) -> dict[str, object]:
 def _camera(clip: Clip, target: np.ndarray, ranges: np.ndarray) -> dict[str, object]:
     """A view from behind and above the clip's first camera, in the scene's own units."""
     pose = invert(clip.extrinsics[0])
-    up = -pose[:3, 1]
+    up = _up(clip)
     back = pose[:3, 3] - target
     eye = target + 1.2 * back + 0.3 * np.linalg.norm(back) * up
     # With aspectmode "data" a scene unit is the geometric mean of the three ranges, counted from their middle.
     unit, middle = np.prod(np.ptp(ranges, axis=-1)) ** (1 / 3), ranges.mean(-1)
     vectors = {"up": up, "eye": (eye - middle) / unit, "center": (target - middle) / unit}
     return {name: {k: float(x) for k, x in zip("xyz", vector, strict=True)} for name, vector in vectors.items()}
+
+
+def _up(clip: Clip) -> np.ndarray:
+    """World z if all cameras stand level on it (plotly then turns the scene like a table), else the first camera's up."""
+    right, up = clip.extrinsics[:, 0, 2], -clip.extrinsics[:, 1, 2]
+    level = np.abs(right).mean() < 0.15 and up.min() > 0.15
+    return np.array([0.0, 0.0, 1.0]) if level else -clip.extrinsics[0, 1, :3].astype(float)
+
+
+def _upright(clip: Clip) -> np.ndarray:
+    """A motion (4, 4) from the world to axes right, down and ahead as the first camera sees them, without its pitch."""
+    down, pose = -_up(clip), np.eye(4)
+    right = clip.extrinsics[0, 0, :3] - (clip.extrinsics[0, 0, :3] @ down) * down
+    right = right / np.linalg.norm(right)
+    pose[:3, :3] = np.stack([right, down, np.cross(right, down)])
+    return pose
 
 
 def _step_args(duration: int, mode: str) -> dict[str, object]:
@@ -199,7 +215,7 @@ def _slider(frames: int) -> dict[str, object]:
     steps = [
         {"label": str(t), "method": "animate", "args": [[str(t)], _step_args(0, "immediate")]} for t in range(frames)
     ]
-    return {"steps": steps, "currentvalue": {"prefix": "frame "}, "x": 0.17, "len": 0.81, "pad": {"t": 4}}
+    return {"steps": steps, "currentvalue": {"prefix": "frame "}, "x": 0.17, "len": 0.81, "pad": {"t": 4, "b": 24}}
 
 
 def _play_button() -> dict[str, object]:
