@@ -5,7 +5,7 @@ import pytest
 
 from tapip3d_lite.clip import load_clip
 from tapip3d_lite.geometry import project, unproject
-from tapip3d_lite.simulate import SimulationConfig, simulate_clip, simulate_dataset, simulator
+from tapip3d_lite.simulate import SimulationConfig, samples, simulate_clip, simulate_dataset, simulator
 from tapip3d_lite.simulate.cameras import random_path
 from tapip3d_lite.simulate.config import CAMERAS, SHAPES
 from tapip3d_lite.simulate.physics import UnstableSceneError, geom_poses, roll_out
@@ -340,3 +340,22 @@ def test_unknown_setting_bad_seed_and_bad_counts(tmp_path):
     for bad in ({"count": 0}, {"count": 1, "first_seed": -1}, {"count": 1, "workers": -2}):
         with pytest.raises(ValueError, match="whole number"):
             simulate_dataset(tmp_path, progress=False, **bad)
+
+
+def test_samples_are_few_small_and_described(tmp_path, monkeypatch):
+    monkeypatch.setattr(samples, "SAMPLES", {"open_sky": samples.SAMPLES["open_sky"]})
+    (path,) = samples.write_samples(tmp_path)
+    clip, exact = load_clip(path), simulate_clip(samples.SAMPLES["open_sky"].seed, sky=True)
+    assert path.stat().st_size < 2e6 and clip.name == "open_sky"
+    assert (clip.depths == 0).any()
+    np.testing.assert_allclose(clip.depths, exact.depths, rtol=1e-5, atol=0)
+    assert different(replace(clip, depths=exact.depths), exact) == []
+    assert "`open_sky.npz`" in (tmp_path / "README.md").read_text(encoding="utf-8")
+
+
+def test_longest_gap_counts_hidden_frames_between_visible_ones():
+    rng = np.random.default_rng(0)
+    visible = rng.uniform(size=(12, 50)) < 0.3
+    texts = ["".join("01"[int(v)] for v in column) for column in visible.T]
+    expected = [max(len(gap) for gap in text.strip("0").split("1")) for text in texts]
+    np.testing.assert_array_equal(samples.longest_gap(visible), expected)

@@ -120,8 +120,8 @@ def _start(rng: np.random.Generator, config: SimulationConfig, moving: bool, rad
 
 
 def _occluder(rng: np.random.Generator, azimuth: float) -> Body:
-    half = np.array([0.15, rng.uniform(0.9, 1.2), rng.uniform(0.9, 1.2)])
-    position = np.array([np.cos(azimuth) * 2.2, np.sin(azimuth) * 2.2, half[2]])
+    half = np.array([0.15, rng.uniform(0.5, 0.7), rng.uniform(0.65, 0.85)])
+    position = np.array([np.cos(azimuth) * 1.9, np.sin(azimuth) * 1.9, half[2]])
     turn = azimuth + rng.uniform(-0.2, 0.2)
     quaternion = np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)])
     return Body("box", half, position, quaternion, np.zeros(3), np.zeros(3), random_texture(rng), False, fixed=True)
