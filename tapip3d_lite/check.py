@@ -20,12 +20,11 @@ from itertools import product
 import numpy as np
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.geometry import invert, pixel_grid, project, unproject
+from tapip3d_lite.consistency import consistency, flatness
+from tapip3d_lite.geometry import invert, pixel_grid, unproject
 
 # A fix must leave at most this share of the error, once for each change that it makes.
 _GAIN = 0.4
-_CAP = 0.25  # relative depth errors above this count as this: the point is simply lost
-_QUANTILE = 0.25
 _NOISE = 0.001  # exact clips stay well below; a mix-up that changes less than this does no harm either
 
 
@@ -72,91 +71,11 @@ def check_clip(clip: Clip) -> list[Finding]:
     if ray is not None:
         findings.append(ray)
         repaired = ray.fix(repaired)
-    moving = np.ptp(clip.extrinsics, axis=0).max() > 1e-6
-    return findings + (_wrong_motion(repaired) if moving else _whole_numbers(repaired))
+    return findings + (_wrong_motion(repaired) if _moves(clip) else _whole_numbers(repaired))
 
 
-def consistency(clip: Clip, samples: int = 1500, pairs: int = 8) -> float:
-    """Static-scene error: how well points carried between frames meet the depth there, over all frame pairs.
-
-    The number is a low quantile of relative depth errors, since much of a correct clip fails the test rightly: what
-    moves, what gets hidden, what leaves the view.
-
-    Args:
-        clip: the clip.
-        samples: pixels lifted per pair.
-        pairs: frame pairs, spread over the clip at growing gaps.
-
-    Returns:
-        0 for a perfect static scene; at most 0.25, the value of a point that is lost altogether.
-    """
-    rng = np.random.default_rng(0)
-    errors = [_carry(clip, t, s, samples, rng) for t, s in _frame_pairs(len(clip), pairs)]
-    pooled = np.concatenate(errors) if errors else np.zeros(1)
-    return float(np.quantile(pooled, _QUANTILE)) if pooled.size else _CAP
-
-
-def flatness(clip: Clip, frames: int = 4) -> float:
-    """Lower quartile of the relative second differences of inverse depth: near 0 where scenes hold planes.
-
-    Args:
-        clip: the clip.
-        frames: how many frames to look at.
-
-    Returns:
-        The quartile over pixels, dimensionless; the step is a twelfth of the image.
-    """
-    step = max(1, min(clip.size) // 12)
-    values = [_second_differences(clip.depths[t], step) for t in np.linspace(0, len(clip) - 1, frames).astype(int)]
-    values = np.concatenate(values)
-    return float(np.quantile(values, 0.25)) if values.size else 0.0
-
-
-def _frame_pairs(frames: int, pairs: int) -> list[tuple[int, int]]:
-    gaps = sorted({max(1, round(frames * share)) for share in (0.1, 0.25, 0.5)})
-    chosen = [(t, t + gap) for gap in gaps for t in np.linspace(0, max(frames - gap - 1, 0), pairs // 2).astype(int)]
-    return [(t, s) for t, s in dict.fromkeys(chosen) if s < frames]
-
-
-def _carry(clip: Clip, t: int, s: int, samples: int, rng: np.random.Generator) -> np.ndarray:
-    """Capped relative depth errors of pixels of frame t seen from frame s."""
-    v, u = np.nonzero(clip.depths[t])
-    if not len(v):
-        return np.zeros(0)
-    pick = rng.integers(0, len(v), samples)
-    uv = np.stack([u[pick], v[pick]], -1).astype(np.float64)
-    cameras = [clip.intrinsics[[t, s]].astype(np.float64), clip.extrinsics[[t, s]].astype(np.float64)]
-    points = unproject(uv, clip.depths[t, v[pick], u[pick]].astype(np.float64), cameras[0][0], cameras[1][0])
-    target, z = project(points, cameras[0][1], cameras[1][1])
-    seen = _bilinear_inverse(clip.depths[s], target)
-    inside = np.isfinite(seen) & (z > 0)
-    error = np.full(samples, _CAP)
-    error[inside] = np.minimum(np.abs(z[inside] * seen[inside] - 1), _CAP)
-    return error[~np.isnan(seen)]  # a pixel without depth speaks neither for nor against
-
-
-def _bilinear_inverse(depth: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """1/z at sub-pixel positions (exact on planes): NaN on invalid depth, infinite outside the image."""
-    height, width = depth.shape
-    with np.errstate(divide="ignore"):
-        inverse = np.where(depth > 0, 1 / depth.astype(np.float64), np.nan)
-    inside = ((uv >= 0) & (uv <= (width - 1, height - 1))).all(-1)
-    safe = np.where(inside[:, None], uv, 0)
-    u0, v0 = np.minimum(safe.astype(int), (width - 2, height - 2)).T
-    a, b = safe[:, 0] - u0, safe[:, 1] - v0
-    top = inverse[v0, u0] * (1 - a) + inverse[v0, u0 + 1] * a
-    bottom = inverse[v0 + 1, u0] * (1 - a) + inverse[v0 + 1, u0 + 1] * a
-    return np.where(inside, top * (1 - b) + bottom * b, np.inf)
-
-
-def _second_differences(depth: np.ndarray, step: int) -> np.ndarray:
-    with np.errstate(divide="ignore"):
-        inverse = np.where(depth > 0, 1 / depth.astype(np.float64), np.nan)
-    horizontal = inverse[:, 2 * step :] + inverse[:, : -2 * step] - 2 * inverse[:, step:-step]
-    vertical = inverse[2 * step :] + inverse[: -2 * step] - 2 * inverse[step:-step]
-    relative = [horizontal / inverse[:, step:-step], vertical / inverse[step:-step]]
-    values = np.abs(np.concatenate([r.ravel() for r in relative]))
-    return values[np.isfinite(values)]
+def _moves(clip: Clip) -> bool:
+    return bool(np.ptp(clip.extrinsics, axis=0).max() > 1e-6)
 
 
 def _wrong_intrinsics(clip: Clip) -> Iterator[Finding]:
@@ -167,25 +86,36 @@ def _wrong_intrinsics(clip: Clip) -> Iterator[Finding]:
     focal = float(np.median(clip.intrinsics[:, 0, 0]))
     offset = float(np.abs(point / centre - 1).max())
     if focal < width / 20 and (np.abs(point) < 2).all():
-        size = np.array([width, height])
-        scaled = _with_intrinsics(size, -0.5)
+        scaled = _with_intrinsics(np.array([width, height]), -0.5)
         message = f"intrinsics look normalised: fx = {focal:.3g} for an image {width} pixels wide"
         remedy = "Multiply row 0 by W and row 1 by H, then subtract 0.5 from cx and cy."
         name = "normalised_intrinsics"
-    elif offset > 0.35 and np.ptp(np.log((point / centre).clip(1e-6))) < 0.3:
+    elif offset > 0.1 and (point > 0).all():
         ratio = centre / point
         scaled = _with_intrinsics(ratio, 0.0)
+        likely = offset > 0.35 and np.ptp(np.log(ratio)) < 0.3  # a crop shifts the point, too: motion decides
+        if not _motion_prefers(clip, scaled(clip), likely):
+            return
         size = np.rint(2 * point + 1).astype(int)
         message = f"intrinsics look made for a {size[0]}x{size[1]} image, the video is {width}x{height}"
         remedy = f"Multiply row 0 by {ratio[0]:.4g} and row 1 by {ratio[1]:.4g} (geometry.resize_intrinsics)."
+        if not _moves(clip):
+            remedy += " Not so if the frames are a crop off the centre, which a still camera cannot tell apart."
         name = "intrinsics_of_another_size"
     else:
         return
     fixed = np.median(scaled(clip).intrinsics[:, :2, 2], axis=0)
     after = float(np.abs(fixed / centre - 1).max())
-    yield Finding(
-        name, message, "principal point's distance from the centre, in half images", offset, after, remedy, scaled
-    )
+    measure = "principal point's distance from the centre, in half images"
+    yield Finding(name, message, measure, offset, after, remedy, scaled)
+
+
+def _motion_prefers(clip: Clip, fixed: Clip, otherwise: bool) -> bool:
+    """Whether static-scene consistency speaks for the fix; `otherwise` where it says nothing either way."""
+    before, after = consistency(clip), consistency(fixed)
+    if max(before, after) < 0.1 * _NOISE or min(before, after) > _GAIN * max(before, after):
+        return otherwise
+    return after < before
 
 
 def _with_intrinsics(scale: np.ndarray, shift: float) -> Callable[[Clip], Clip]:
@@ -267,12 +197,21 @@ def _wrong_motion(clip: Clip) -> list[Finding]:
     poses = [[], [_POSES[0]], [_POSES[1]], _POSES]
     units = [[], [_UNITS[0]], [_UNITS[1]]]
     scored = []
-    for fixes in ([*p, *u] for p, u in product(poses, units)):
-        error = consistency(_apply(clip, fixes))
-        scored.append((error / _GAIN ** len(fixes), error, fixes))
+    for pose, unit in product(poses, units):
+        turned = _apply(clip, pose)
+        if unit and not _plausible_unit(turned, unit[0][0]):
+            continue
+        error = consistency(_apply(turned, unit))
+        scored.append((error / _GAIN ** len(pose + unit), error, pose + unit))
     _, after, fixes = min(scored, key=lambda row: row[0])
     measure = "relative depth error of the static scene"
     return [Finding(n, m, measure, before, after, remedy, fix) for n, m, remedy, fix in fixes]
+
+
+def _plausible_unit(clip: Clip, name: str) -> bool:
+    """Whether the camera's travel, measured in depths, is as extreme as a factor of 1000 makes it."""
+    travel = np.ptp(invert(clip.extrinsics)[:, :3, 3], axis=0).max() / np.median(clip.depths[clip.depths > 0])
+    return travel > 1 if name == "poses_in_millimetres" else travel < 0.01
 
 
 def _whole_numbers(clip: Clip) -> list[Finding]:

@@ -88,7 +88,9 @@ def test_mix_ups_are_named_and_the_fix_repairs(moving, names):
 @pytest.mark.parametrize("name", ALWAYS)
 def test_some_mix_ups_show_without_camera_motion(still, name):
     for clip in still:
-        assert [f.name for f in t3d.check_clip(ALWAYS[name](clip))] == [name]
+        findings = t3d.check_clip(ALWAYS[name](clip))
+        assert [f.name for f in findings] == [name]
+        assert ("crop" in findings[0].remedy) == (name == "intrinsics_of_another_size")
 
 
 def test_whole_numbers_betray_millimetres_without_camera_motion(still):
@@ -116,3 +118,26 @@ def test_a_clip_with_swapped_poses_can_be_loaded_and_checked(tmp_path):
         t3d.load_clip(tmp_path / "c.npz")
     findings = t3d.check_clip(t3d.load_clip(tmp_path / "c.npz", points=False))
     assert [f.name for f in findings] == ["camera_to_world"]
+
+
+def cropped(clip):
+    """The lower right 60 % of every frame, with the principal point moved as it should be."""
+    top, left = (int(0.4 * side) for side in clip.size)
+    matrix = clip.intrinsics.copy()
+    matrix[:, :2, 2] -= (left, top)
+    return replace(clip, video=clip.video[:, top:, left:], depths=clip.depths[:, top:, left:], intrinsics=matrix)
+
+
+def test_a_cropped_clip_is_correct(moving):
+    for clip in moving:
+        assert t3d.check_clip(cropped(clip)) == []
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25, (1.5, 3.0)])
+def test_motion_betrays_intrinsics_of_a_slightly_or_unevenly_larger_image(moving, factor):
+    across, down = np.broadcast_to(factor, 2)
+    for clip in moving:
+        findings = t3d.check_clip(replace(clip, intrinsics=clip.intrinsics * rows(across, down)))
+        assert [f.name for f in findings] == ["intrinsics_of_another_size"]
+        repaired = findings[0].fix(replace(clip, intrinsics=clip.intrinsics * rows(across, down)))
+        np.testing.assert_allclose(repaired.intrinsics, clip.intrinsics, rtol=0.01)

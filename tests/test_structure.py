@@ -16,7 +16,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = [
     {"files", "geometry", "validate", "evaluation.metrics"},
     {"clip", "queries"},
-    {"check", "simulate", "degrade", "formats", "model"},
+    {"check", "consistency", "simulate", "degrade", "formats", "model"},
     {"training", "evaluation"},
     {"trackers"},
     {"ui"},
