@@ -53,7 +53,8 @@ def clean(nb):
                 # Widget state is not stored, so a stored view would be an empty box.
                 del data["application/vnd.jupyter.widget-view+json"]
                 data["text/plain"] = "(run the notebook to use this explorer)"
-            output.metadata = {}
+            if "metadata" in output:  # a stream has none
+                output.metadata = {}
     return nb
 
 
