@@ -26,7 +26,7 @@ SAMPLES = {
     "static_camera": Sample(
         102, "The control: without camera motion, world and camera space are alike.", SimulationConfig(camera="static")
     ),
-    "strong_arc": Sample(
+    "arc": Sample(
         100, "The camera sweeps a quarter turn and more: what world space cancels.", SimulationConfig(arc=(90, 120))
     ),
     "handheld": Sample(
