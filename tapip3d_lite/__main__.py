@@ -88,6 +88,14 @@ def samples(out: Path = Path("data_samples")) -> None:
     write_samples(out)
 
 
+def import_(checkpoint: Positional[Path], out: Positional[Path], /) -> None:
+    """Convert the authors' checkpoint (.pth) to a weights file of ours (.safetensors)."""
+    tracker = t3d.load_official(checkpoint)
+    t3d.save_weights(tracker, out)
+    count = sum(p.numel() for p in tracker.parameters())
+    print(f"wrote {out}: {count / 1e6:.2f} M parameters; use it with --tracker {out}")
+
+
 def picture(
     clip: Positional[Path] = Path("data_samples/arc.npz"), /, out: Path = Path("data_samples/picture.png")
 ) -> None:
@@ -105,6 +113,7 @@ COMMANDS = {
     "check": check,
     "simulate": simulate,
     "samples": samples,
+    "import": import_,
     "picture": picture,
 }
 
