@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 import tapip3d_lite as t3d
 from tapip3d_lite.ui.exercises import EXERCISES
@@ -61,6 +62,29 @@ def test_shape_type_and_crash_are_told_in_words(double):
     assert judge(double, lambda x: x / 2).hint == "multiply, do not divide."
 
 
+def test_nan_and_dtype_are_told_in_words(double):
+    assert "got nan (1 of 1 values differ, among them NaN)" in judge(double, lambda x: x * np.nan).message
+    assert "expected whole numbers (int64), got float64" in compare(np.ones(2), np.ones(2, np.int64), 1e-6)
+    assert compare(1.0, 1, 1e-6) == ""
+
+
+def test_a_crash_shows_the_learners_line_not_the_librarys(double):
+    crash = judge(double, lambda x: np.linalg.inv(x))
+    assert "LinAlgError" in crash.message and "np.linalg.inv(x))" in crash.message
+    assert "The input was [" in crash.message
+    assert "TypeError" in judge(double, ord).message  # no Python frame at all
+
+
+def test_tensors_are_cases_too():
+    def half(x):
+        x /= 2
+        return x
+
+    tensors = Exercise("test.half", lambda x: x / 2, lambda rng, size: (torch.ones(size, 2),), ())
+    assert judge(tensors, half).status == "passed"
+    assert "input was [[1. 1.]]" in judge(tensors, lambda x: x).message
+
+
 def test_an_answer_cannot_change_the_case(double):
     def spoils(x):
         x *= 2
@@ -82,6 +106,7 @@ def test_guesses():
     assert "3 px" in str(score(None, 3.0, "px"))
     assert (score(2.9, 3.0).status, score(6, 3.0).status) == ("passed", "wrong")
     assert "2 times" in str(score(6, 3.0))
+    assert (score("a lot", 3.0).status, score("world", "world").status) == ("wrong", "passed")
     assert (score("World", "world").status, score("uvd", "world").status) == ("passed", "wrong")
 
 

@@ -2,12 +2,11 @@
 
 import json
 import re
-from pathlib import Path
 
 import nbformat
 import pytest
 
-from tests.notebook_tools import FOLDER, clean, notebooks, run, solution_copy, solution_of, tags
+from tests.notebook_tools import clean, notebooks, run, solution_copy, solution_of, tags
 
 NOTEBOOKS = notebooks()
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
@@ -94,15 +93,51 @@ def test_exercises_are_whole(path):
 
 @each_notebook
 def test_solutions_pass(path):
-    nb = run(clean(solution_copy(read(path))), FOLDER)
-    for cell, output in outputs(nb):
+    nb = run(solution_copy(read(path)))
+    checkers = [c for c in code_cells(nb) if "exercises.check(" in c.source]
+    assert len(checkers) == sum("exercise" in tags(c) for c in nb.cells)
+    for cell in checkers:
+        shown = "".join(o.get("data", {}).get("text/plain", "") for o in cell.outputs)
+        assert "passed" in shown, f"{cell.source}\n{shown}"
+
+
+@each_notebook
+def test_stubs_are_not_attempted_in_the_committed_outputs(path):
+    for cell, output in outputs(read(path)):
         if "exercises.check(" in cell.source:
-            shown = output.get("data", {}).get("text/plain", "") or output.get("text", "")
-            assert "passed" in shown, f"{cell.source}\n{shown}"
+            assert "not attempted" in output["data"]["text/plain"], cell.source
 
 
-def test_stubs_are_not_attempted_in_the_committed_outputs():
-    for path in NOTEBOOKS:
-        for cell, output in outputs(read(path)):
-            if "exercises.check(" in cell.source and "data" in output:
-                assert "not attempted" in output["data"]["text/plain"], Path(path).name
+@pytest.fixture
+def small():
+    """A notebook with one exercise and everything that must not be stored."""
+    fold = (
+        "<details><summary>Hint 1</summary>\n\n```python\nno\n```\n\n</details>\n\n<details><summary>Solution</summary>"
+    )
+    cells = [
+        nbformat.v4.new_code_cell("def f():\n    ...", metadata={"tags": ["exercise"], "execution": {"started": "now"}}),
+        nbformat.v4.new_code_cell(
+            "import sys; print(f()); print('/home/me/x/notebooks/a.png'); print('w', file=sys.stderr)"
+        ),
+        nbformat.v4.new_markdown_cell(f"{fold}\n\n```python\ndef f():\n    return 41 + 1\n```\n\n</details>"),
+    ]
+    return nbformat.v4.new_notebook(cells=cells, metadata={"widgets": {"state": {}}})
+
+
+def test_a_solution_copy_runs_the_folded_code_and_leaves_the_stub_alone(small):
+    done = clean(run(solution_copy(small)))
+    nbformat.validate(done)
+    assert [o.text for o in done.cells[1].outputs] == ["42\nnotebooks/a.png\n"]  # no stderr, no home
+    assert "widgets" not in done.metadata and done.cells[0].metadata == {"tags": ["exercise"]}
+    assert small.cells[0].source.endswith("...")
+    del small.cells[2]
+    with pytest.raises(ValueError, match="no folded solution"):
+        solution_copy(small)
+
+
+def test_a_stored_scene_and_explorer_leave_their_text(small):
+    scene = {"application/vnd.plotly.v1+json": {}, "text/plain": "3D scene"}
+    view = {"application/vnd.jupyter.widget-view+json": {}, "text/plain": "VBox(...)"}
+    small.cells[1].outputs = [nbformat.v4.new_output("display_data", d) for d in (scene, view)]
+    stored = [o.data for o in clean(small).cells[1].outputs]
+    assert stored == [{"text/plain": "3D scene"}, {"text/plain": "(run the notebook to use this explorer)"}]

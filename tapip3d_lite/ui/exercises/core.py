@@ -6,6 +6,7 @@ the answer computes: if it agrees with a known mistake on that case, it gets the
 
 from __future__ import annotations
 
+import copy
 import html
 import traceback
 from collections.abc import Callable
@@ -88,7 +89,8 @@ def judge(exercise: Exercise, answer: Answer) -> Verdict:
             except NotImplementedError:
                 return _not_attempted()
             except Exception as error:
-                return Verdict("wrong", _crash(error, arguments), _hint(exercise, arguments, error))
+                message = f"{_crash(error)}\nThe input was {describe(arguments)}"
+                return Verdict("wrong", message, _hint(exercise, arguments, error))
             if got is None or got is Ellipsis:
                 return _not_attempted()
             difference = compare(got, expected, exercise.tolerance)
@@ -113,14 +115,16 @@ def compare(got: object, expected: object, tolerance: float) -> str:
         return f"expected an array, got {type(got).__name__}"
     if a.shape != b.shape:
         return f"expected shape {b.shape}, got {a.shape}"
+    if b.ndim and a.dtype.kind == "f" and b.dtype.kind in "bi":
+        return f"expected whole numbers ({b.dtype}), got {a.dtype}"
     same = np.isclose(a.astype(float), b.astype(float), rtol=tolerance, atol=tolerance, equal_nan=True)
     if same.all():
         return ""
+    lost = ", among them NaN" if np.isnan(a[~same].astype(float)).any() else ""
     where = tuple(int(i) for i in np.argwhere(~same)[0])
     place = f"at index {where}: " if where else ""
-    return (
-        f"{place}expected {_number(b[where])}, got {_number(a[where])} ({(~same).sum()} of {same.size} values differ)"
-    )
+    share = f"{(~same).sum()} of {same.size} values differ{lost}"
+    return f"{place}expected {_number(b[where])}, got {_number(a[where])} ({share})"
 
 
 def describe(arguments: tuple) -> str:
@@ -138,9 +142,9 @@ def score_guess(guess: float | str | None, truth: float | str, unit: str = "") -
     """
     if guess is None:
         return Verdict("not attempted", f"no guess committed; measured: {_number(truth)} {unit}".rstrip())
-    if isinstance(truth, str):
-        right = str(guess).strip().lower() == truth.lower()
-        return Verdict("passed" if right else "wrong", f"you said {guess}; measured: {truth}")
+    if isinstance(truth, str) or isinstance(guess, str):
+        right = str(guess).strip().lower() == str(truth).lower()
+        return Verdict("passed" if right else "wrong", f"you said {guess}; measured: {_number(truth)} {unit}".rstrip())
     close = abs(float(guess) - truth) <= 0.25 * abs(truth)
     factor = f", {float(guess) / truth:.2g} times as much" if truth else ""
     return Verdict(
@@ -170,17 +174,19 @@ def _tupled(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _crash(error: Exception, arguments: tuple) -> str:
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    line = f" (line {frame.lineno}: {frame.line})" if frame.line else f" (line {frame.lineno})"
-    return f"{type(error).__name__}: {error}{line}\nThe input was {describe(arguments)}"
+def _crash(error: Exception) -> str:
+    frames = traceback.extract_tb(error.__traceback__)[1:]
+    own = [f for f in frames if f.filename == frames[0].filename]  # the learner's cell, not the library it calls
+    where = f" (line {own[-1].lineno}: {own[-1].line})" if own else ""
+    return f"{type(error).__name__}: {error}{where}"
 
 
 def _copied(arguments: tuple) -> tuple:
-    return tuple(a.copy() if isinstance(a, np.ndarray) else a for a in arguments)
+    return copy.deepcopy(arguments)  # an answer may change its arguments; arrays and tensors alike
 
 
 def _described(value: object) -> str:
+    value = value.detach().cpu().numpy() if hasattr(value, "detach") else value
     if isinstance(value, np.ndarray):
         small = value.size <= 12
         return (
