@@ -67,6 +67,7 @@ class TrackerConfig:
         offset_layers, offset_dim: the MLP on Fourier-embedded offsets.
         share_levels: one context for all levels instead of one each.
         use_features: append the query's own feature to the context.
+        depth_ratio: let the correlation context see how depths around the estimate compare with its own.
         use_uv: append pixel coordinates to the trajectory token.
         hidden, heads, head_dim, mlp_ratio: the updating transformer.
         time_depth, space_depth: its blocks over time, and of those the ones followed by blocks over tracks.
@@ -101,6 +102,7 @@ class TrackerConfig:
     offset_dim: int = 128
     share_levels: bool = False
     use_features: bool = False
+    depth_ratio: bool = False
     use_uv: bool = True
     hidden: int = 384
     heads: int = 8
@@ -189,6 +191,22 @@ class TrackerConfig:
             raise ValueError(
                 f"TrackerConfig: neighborhood {self.neighborhood!r} with context {self.context!r}: planes are read only by "
                 "the context 'planes', and it reads nothing else; set both or none"
+            )
+        if self.context == "correlation" and self.neighborhood == "knn":
+            raise ValueError(
+                "TrackerConfig: context 'correlation' compares cells place by place, and nearest neighbours have no places; "
+                "set neighborhood='window'"
+            )
+        if self.neighborhood in ("window", "planes") and round(self.neighbors**0.5) ** 2 != self.neighbors:
+            raise ValueError(
+                f"TrackerConfig.neighbors: a window is square, so K must be 9, 25, 49, …; got {self.neighbors}"
+            )
+        if self.depth_ratio and (self.context != "correlation" or self.space == "uv"):
+            raise ValueError("TrackerConfig.depth_ratio: only context 'correlation' in a space with depth reads it")
+        if self.space == "uvd" and self.norm_mode == "isotropic":
+            raise ValueError(
+                "TrackerConfig: space 'uvd' mixes pixels and scene units, which have no common scale; "
+                "set norm_mode='anisotropy'"
             )
         if self.space == "uv" and self.neighborhood == "planes":
             raise ValueError("TrackerConfig: three planes need three axes, but space 'uv' has two; use 'uvd'")

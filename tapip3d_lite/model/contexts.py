@@ -127,3 +127,31 @@ class N2N(Context):
         support = kept[..., : kept.shape[-2] - self.use_features, :]
         out = self.pairs[index % len(self.pairs)](support.flatten(0, 2), context.flatten(0, 2)).unflatten(0, lead)
         return torch.cat([out, kept[..., -1, :]], -1) if self.use_features else out
+
+
+class P2N(Context):
+    """Point to neighbourhood (the paper's "without N2N"): the query alone looks at the context, in one direction."""
+
+    def __init__(self, config: TrackerConfig) -> None:
+        super().__init__()
+        self.embed = CellEmbedding(config)
+        copies = 1 if config.share_levels else config.levels
+        sizes = config.token_dim, config.context_heads, config.context_head_dim
+        self.looks = nn.ModuleList(Block(*sizes, config.context_mlp_ratio, cross=True) for _ in range(copies))
+        self.width = config.token_dim
+
+    def prepare(self, index: int, level: Level) -> Level:
+        """As for `N2N`."""
+        return replace(level, features=self.embed.features(level.features))
+
+    def describe(self, index: int, support: Neighbors) -> Tensor:
+        """The query's token (B, N, D), without its neighbourhood."""
+        own = self.embed.features(support.features[..., 0, :])
+        return own + self.embed.offset(index, support.offsets[..., 0, :])
+
+    def forward(self, index: int, kept: Tensor, near: Neighbors) -> Tensor:
+        """See `Context.forward`."""
+        context = near.features + self.embed.offset(index, near.offsets)  # (B, S, N, K, D)
+        query = kept[:, None, :, None].expand(*context.shape[:3], 1, -1)
+        look = self.looks[index % len(self.looks)]
+        return look(query.flatten(0, 2), context.flatten(0, 2)).squeeze(-2).unflatten(0, context.shape[:3])

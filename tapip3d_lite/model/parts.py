@@ -7,16 +7,18 @@ from typing import Any
 from torch import nn
 
 from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.contexts import N2N
+from tapip3d_lite.model.contexts import N2N, P2N
+from tapip3d_lite.model.correlations import Correlation, PlaneCorrelation
+from tapip3d_lite.model.grids import Planes, Window
 from tapip3d_lite.model.neighbors import KNearest
-from tapip3d_lite.model.spaces import Camera, World
-from tapip3d_lite.model.updater import Transformer
+from tapip3d_lite.model.spaces import UV, UVD, Camera, UVLogD, World
+from tapip3d_lite.model.updater import Temporal, Transformer
 
 PARTS: dict[str, dict[str, type]] = {
-    "space": {"world": World, "camera": Camera},
-    "neighborhood": {"knn": KNearest},
-    "context": {"n2n": N2N},
-    "updater": {"transformer": Transformer},
+    "space": {"uv": UV, "uvd": UVD, "uvlogd": UVLogD, "camera": Camera, "world": World},
+    "neighborhood": {"knn": KNearest, "window": Window, "planes": Planes},
+    "context": {"n2n": N2N, "p2n": P2N, "correlation": Correlation, "planes": PlaneCorrelation},
+    "updater": {"transformer": Transformer, "temporal": Temporal},
 }
 
 

@@ -22,6 +22,7 @@ from tapip3d_lite.model.frames import Frames
 from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.parts import make_module, make_space
 from tapip3d_lite.model.scene import Scene, Step, Window, to_world
+from tapip3d_lite.model.stream import Stream
 from tapip3d_lite.model.support import query_support
 from tapip3d_lite.model.tokens import token_width, trajectory_tokens
 from tapip3d_lite.model.windows import State, window_ends
@@ -173,7 +174,8 @@ class Tracker(nn.Module):
         pixels = uv if self.config.use_uv else None
         tokens = trajectory_tokens(coords, logits, evidence, pixels, frames.size, self.time)
         delta = self.updater(tokens, window.active).float()
-        return coords + delta[..., :3], logits + delta[..., 3]
+        moves = delta.new_tensor(getattr(window.scene.space, "moves", (1.0, 1.0, 1.0)))
+        return coords + delta[..., :3] * moves, logits + delta[..., 3]
 
     def evidence(self, window: Window, coords: Tensor, uv: Tensor) -> Tensor:
         """Collect each estimate's neighbourhood and compare it with the query's, at all levels.
@@ -201,6 +203,10 @@ class Tracker(nn.Module):
     def track(self, clip: Clip, queries: Any = None, **options: Any) -> Tracks:
         """Track points of one clip; see `inference.track` for the options."""
         return inference.track(self, clip, queries, **options)
+
+    def stream(self, queries: Any, **options: Any) -> Stream:
+        """Track while frames come in: `push` each, then `finish`; see `stream.Stream` for the options."""
+        return Stream(self, queries, **options)
 
     def _check(self, frames: Frames, iterations: int) -> None:
         if frames.size != self.config.image_size:

@@ -59,3 +59,23 @@ class Transformer(nn.Module):
         points = x[:, :, :count]
         out = self.head(points)
         return out if self.vis_head is None else torch.cat([out, self.vis_head(points)], -1)
+
+
+class Temporal(nn.Module):
+    """The same blocks over time and no attention across tracks: each trajectory is corrected alone."""
+
+    def __init__(self, config: TrackerConfig, inputs: int) -> None:
+        super().__init__()
+        self.input = nn.Linear(inputs, config.hidden)
+        sizes = config.hidden, config.heads, config.head_dim, config.mlp_ratio
+        self.time = nn.ModuleList(Block(*sizes) for _ in range(config.time_depth))
+        self.head = nn.Linear(config.hidden, 4)
+        nn.init.normal_(self.head.weight, std=1e-3)
+        nn.init.zeros_(self.head.bias)
+
+    def forward(self, tokens: Tensor, active: Tensor | None = None) -> Tensor:
+        """See `Transformer.forward`; `active` has no meaning where tracks do not meet."""
+        x = self.input(tokens).transpose(1, 2)
+        for block in self.time:
+            x = block(x)
+        return self.head(x.transpose(1, 2))

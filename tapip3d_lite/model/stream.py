@@ -1,0 +1,163 @@
+"""Tracking while frames come in: push frames, get each window's tracks as soon as it is complete.
+
+Paper: section 3.4; sliding windows look S frames ahead and no further, so nothing else of the video is needed. The
+result equals the offline tracker's forward pass on the same frames.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.model.frames import Frames, frames_from_clip
+from tapip3d_lite.model.neighbors import Neighbors
+from tapip3d_lite.model.parts import make_space
+from tapip3d_lite.model.scene import to_world
+from tapip3d_lite.model.windows import State
+
+
+class Stream:
+    """Tracks of queries that are known in advance, over frames that are not.
+
+    Args:
+        tracker: in evaluation mode.
+        queries: (N, 4) rows (t, x, y, z), world; t counts pushed frames and may lie in the future.
+        space: as for `track`.
+        iterations: M, the config's if None.
+        depth_roi: depths (near, far) that count for the scale; None: all. It cannot be found from the whole clip here.
+        visible_threshold: probability from which a point counts as visible.
+    """
+
+    def __init__(
+        self,
+        tracker: nn.Module,
+        queries: np.ndarray,
+        space: Any = None,
+        iterations: int | None = None,
+        depth_roi: tuple[float, float] | None = None,
+        visible_threshold: float = 0.9,
+    ) -> None:
+        device = next(tracker.parameters()).device
+        self.tracker, self.space, self.roi = tracker, make_space(space or tracker.space), depth_roi
+        self.iterations, self.threshold = iterations or tracker.config.iterations, visible_threshold
+        self.queries = np.asarray(queries, np.float32).reshape(-1, 4)
+        self.rows = torch.from_numpy(self.queries).to(device)[None]
+        count = len(self.queries)
+        nothing = torch.zeros(1, 0, count, 3, device=device)
+        self.state = State(nothing, nothing[..., 0], nothing.new_zeros(1, count, 3), self.rows[..., 0].long())
+        self.window: list[tuple[Frames, Tensor]] = []  # the last S frames with their features
+        self.cameras: list[tuple[Tensor, Tensor, Tensor]] = []  # intrinsics, extrinsics, depth of every frame
+        self.support: list[Neighbors] = []
+        self.xyz = np.zeros((0, count, 3), np.float32)
+        self.seen = 0
+
+    def push(
+        self, image: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray
+    ) -> Tracks | None:
+        """Take one frame.
+
+        Args:
+            image: (H, W, 3) uint8.
+            depth: (H, W); 0 = unknown.
+            intrinsics: (3, 3).
+            extrinsics: (4, 4) world to camera.
+
+        Returns:
+            When a window is complete the tracks of its S frames, the last one being this frame; else None. Frames of
+            the overlap with the window before are told again, improved.
+
+        Raises:
+            ValueError: arrays that do not fit, as for `Clip`.
+        """
+        clip = Clip(image[None], depth[None], np.asarray(intrinsics)[None], np.asarray(extrinsics)[None])
+        frames = frames_from_clip(clip, self.tracker.config.image_size, self.rows.device)
+        with torch.no_grad():
+            return self._push(frames, self.tracker.encoder(frames.rgb))
+
+    @torch.no_grad()
+    def finish(self) -> Tracks:
+        """The last frame is repeated to complete a half window, as offline; returns the tracks of all frames."""
+        real = self.seen
+        while self.seen and self.seen % (self.tracker.config.window // 2):
+            self._push(*self.window[-1])
+        return self._tracks(0, real)
+
+    def _push(self, frames: Frames, features: Tensor) -> Tracks | None:
+        state, size, now = self.state, self.tracker.config.window, self.seen
+        flat = getattr(self.space, "moves", (1.0, 1.0, 1.0))[2] == 0
+        depth = frames.depths if flat else frames.depths[..., :1, :1]  # only flat spaces need it once lifted
+        self.cameras.append((frames.intrinsics, frames.extrinsics, depth))
+        arriving = state.times[0] == now
+        if bool(arriving.any()):
+            mine = self.rows[:, None, arriving, 1:]
+            state.queries[:, arriving] = self.space.from_world(mine, frames.intrinsics, frames.extrinsics)[:, 0]
+            state.coords[:, :, arriving] = state.queries[:, None, arriving]
+        state.coords = torch.cat([state.coords, state.queries[:, None]], 1)
+        state.logits = torch.cat([state.logits, state.coords.new_zeros(1, 1, len(self.queries))], 1)
+        self.xyz = np.concatenate([self.xyz, self._still(slice(now, now + 1), slice(None))])
+        if bool(arriving.any()):
+            self.xyz[:, arriving.cpu().numpy()] = self._still(slice(0, now + 1), arriving)
+        self.window = [*self.window[-(size - 1) :], (frames, features)]
+        self.seen += 1
+        if self.seen < size or (self.seen - size) % (size // 2):
+            return None
+        return self._solve(self.seen - size, self.seen)
+
+    def _still(self, frames: slice, tracks: Any) -> np.ndarray:
+        """Tracks that have not been solved yet: they stay at their query, seen by each frame's camera."""
+        cameras = (torch.cat(parts, 1) for parts in zip(*self.cameras[frames], strict=True))
+        coords = self.state.queries[:, None, tracks].expand(-1, len(self.cameras[frames]), -1, -1)
+        with torch.autocast(coords.device.type, enabled=False):
+            return self.space.to_world(coords, *cameras)[0].cpu().numpy()
+
+    def _solve(self, start: int, stop: int) -> Tracks:
+        columns, mask = self.state.members(stop, None)
+        if len(columns):
+            frames = Frames(
+                *(torch.cat([getattr(f, name) for f, _ in self.window], 1) for name in Frames.__annotations__)
+            )
+            features = torch.cat([x for _, x in self.window], 1)
+            scene = self.tracker.scene(frames, features, self.space, self.roi)
+            self._add_support(scene, start, stop)
+            coords, logits = self.state.initial(start, stop, columns)
+            window = self.tracker.window(scene, [near.pick(columns) for near in self.support], mask)
+            coords = window.norm.normalize(coords)
+            for _ in range(self.iterations):
+                coords, logits = self.tracker.update(window, coords, logits)
+            coords = window.norm.restore(coords)
+            self.state.write(start, stop, columns, mask, coords, logits)
+            self.xyz[start:stop, columns.cpu().numpy()] = to_world(coords, frames, self.space)[0].cpu().numpy()
+        return self._tracks(start, stop)
+
+    def _add_support(self, scene: Any, start: int, stop: int) -> None:
+        """Collect the neighbourhoods of queries that this window is the first to contain."""
+        half = self.tracker.config.window // 2
+        times = self.state.times[0]
+        new = ((times < stop) & (times >= (0 if start == 0 else stop - half))).nonzero()[:, 0]
+        if not len(new):
+            return
+        rows = self.rows[:, new].clone()
+        rows[..., 0] -= start
+        found = self.tracker.support(scene, rows, self.state.queries[:, new])
+        if not self.support:
+            self.support = [_empty(near, len(times)) for near in found]
+        for whole, near in zip(self.support, found, strict=True):
+            for name in ("features", "points", "center", "indices"):
+                if getattr(near, name) is not None:
+                    getattr(whole, name)[:, new] = getattr(near, name)
+
+    def _tracks(self, start: int, stop: int) -> Tracks:
+        logits = self.state.logits[0, start:stop].cpu().numpy()
+        visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= self.threshold
+        return Tracks(self.xyz[start:stop].copy(), visible, self.queries, logits)
+
+
+def _empty(near: Neighbors, count: int) -> Neighbors:
+    def room(x: Tensor | None) -> Tensor | None:
+        return None if x is None else x.new_zeros(1, count, *x.shape[2:])
+
+    return Neighbors(room(near.features), room(near.points), room(near.center), room(near.indices))

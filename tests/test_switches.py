@@ -1,0 +1,256 @@
+"""Every value of the four switches: against naive loops, differentiable, and refused where it cannot work."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+import tapip3d_lite as t3d
+from tapip3d_lite.model.cloud import Level
+from tapip3d_lite.model.contexts import P2N
+from tapip3d_lite.model.correlations import Correlation, PlaneCorrelation
+from tapip3d_lite.model.grids import EXTENT, Planes, Window, splat
+from tapip3d_lite.model.neighbors import Neighbors
+from tapip3d_lite.model.spaces import UV, UVD, UVLogD
+
+TINY = {"image_size": (48, 48), "window": 4, "levels": 2, "iterations": 1, "feature_dim": 16, "token_dim": 16}
+
+
+def config(**changes):
+    sizes = TINY | {"neighbors": 9, "context_head_dim": 16, "offset_dim": 8} | changes
+    return t3d.TrackerConfig.preset("lite", **sizes)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def random_level(g, shape=(1, 2, 5, 7), channels=3):
+    return Level(
+        torch.randn(*shape, channels, generator=g),
+        torch.randn(*shape, 3, generator=g),
+        torch.rand(shape, generator=g) > 0.2,
+    )
+
+
+def test_window_is_the_loop_and_clamps_at_borders():
+    level = random_level(generator())
+    cells = torch.tensor([[2.2, 1.7], [-3.0, 9.0], [6.4, 0.4]]).expand(1, 2, 3, 2)
+    coords = torch.randn(1, 2, 3, 3, generator=generator(1))
+    near = Window(config(neighborhood="window"))(level, coords, cells)
+    for t, n in product(range(2), range(3)):
+        for k, (dv, du) in enumerate(product((-1, 0, 1), (-1, 0, 1))):
+            u = int(np.clip(np.rint(cells[0, t, n, 0].item() + du), 0, 6))
+            v = int(np.clip(np.rint(cells[0, t, n, 1].item() + dv), 0, 4))
+            assert near.indices[0, t, n, k] == v * 7 + u
+            torch.testing.assert_close(near.features[0, t, n, k], level.features[0, t, v, u])
+            torch.testing.assert_close(near.offsets[0, t, n, k], level.points[0, t, v, u] - coords[0, t, n])
+
+
+def test_window_interpolates_for_correlation():
+    height, width = 5, 7
+    ramp = torch.stack(torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij"), -1)[None, None]
+    level = Level(ramp, torch.zeros(1, 1, height, width, 3), torch.ones(1, 1, height, width, dtype=torch.bool))
+    cells = torch.tensor([[[[3.25, 2.5]]]])
+    near = Window(config(neighborhood="window", context="correlation"))(level, torch.zeros(1, 1, 1, 3), cells)
+    expected = [[2.5 + dv, 3.25 + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)]
+    torch.testing.assert_close(near.features[0, 0, 0], torch.tensor(expected))
+
+
+def test_splat_is_the_loop():
+    g = generator(3)
+    features, points = torch.randn(2, 30, 4, generator=g), 2 * torch.randn(2, 30, 3, generator=g)
+    valid = torch.rand(2, 30, generator=g) > 0.3
+    plane = splat(features, points, valid, (1, 2), 6)
+    for f in range(2):
+        total, count = torch.zeros(6, 6, 4), torch.zeros(6, 6, 1)
+        for p in range(30):
+            column, row = (round(float((points[f, p, a] / (2 * EXTENT) + 0.5) * 5)) for a in (1, 2))
+            if valid[f, p] and 0 <= column < 6 and 0 <= row < 6:
+                total[row, column] += features[f, p]
+                count[row, column] += 1
+        torch.testing.assert_close(plane[f], total / count.clamp(min=1))
+
+
+def near_and_kept(g, count=9, channels=16, dtype=torch.float32):
+    def draw(*shape):
+        return torch.randn(*shape, generator=g).to(dtype)
+
+    near = Neighbors(draw(1, 2, 3, count, channels), draw(1, 2, 3, count, 3), draw(1, 2, 3, 3))
+    support = Neighbors(draw(1, 3, 1 + count, channels), draw(1, 3, 1 + count, 3), draw(1, 3, 3))
+    return near, support
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("ratio", [False, True])
+def test_correlation_is_the_loop(ratio):
+    torch.manual_seed(0)
+    context = Correlation(config(neighborhood="window", context="correlation", space="uvlogd", depth_ratio=ratio))
+    near, support = near_and_kept(generator(4))
+    out = context(1, context.describe(1, support), near)
+    for t, n in product(range(2), range(3)):
+        dots = [
+            float(support.features[0, n, 1 + k] @ near.features[0, t, n, j]) / 16**0.5
+            for k in range(9)
+            for j in range(9)
+        ]
+        depth = [float(near.points[0, t, n, j, 2] - near.center[0, t, n, 2]) for j in range(9)] if ratio else []
+        torch.testing.assert_close(out[0, t, n], context.mlps[1](torch.tensor([*dots, *depth])), atol=1e-5, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_p2n_looks_with_the_query_alone():
+    torch.manual_seed(0)
+    context = P2N(config(context="p2n"))
+    near, support = near_and_kept(generator(5))
+    near = Neighbors(context.embed.features(near.features), near.points, near.center)
+    support = Neighbors(
+        support.features, torch.cat([support.center[:, :, None], support.points[:, :, 1:]], 2), support.center
+    )
+    out = context(0, context.describe(0, support), near)
+    for t, n in product(range(2), range(3)):
+        query = context.embed.features(support.features[0, n, 0]) + context.embed.offset(0, torch.zeros(3))
+        bag = torch.stack(
+            [near.features[0, t, n, k] + context.embed.offset(0, near.offsets[0, t, n, k]) for k in range(9)]
+        )
+        torch.testing.assert_close(
+            out[0, t, n], context.looks[0](query[None, None], bag[None])[0, 0], atol=1e-5, rtol=1e-4
+        )
+    others = Neighbors(support.features.clone(), support.points, support.center)
+    others.features[:, :, 1:] = 0
+    torch.testing.assert_close(out, context(0, context.describe(0, others), near))  # the neighbourhood does not matter
+
+
+@torch.no_grad()
+def test_plane_correlation_sums_three_planes():
+    torch.manual_seed(0)
+    part = config(neighborhood="planes", context="planes", space="uvlogd")
+    context, planes = PlaneCorrelation(part), Planes(part)
+    level = context.prepare(0, random_level(generator(6), channels=16))
+    coords, cells = torch.randn(1, 2, 3, 3, generator=generator(7)), torch.rand(1, 2, 3, 2) * 4
+    near = planes(level, coords, cells)
+    assert near.features.shape == (1, 2, 3, 27, 16)
+    kept = torch.randn(1, 3, 16, generator=generator(8))
+    out = context(0, kept, near)
+    for t, n, k in product(range(2), range(3), range(9)):
+        expected = sum(float(kept[0, n] @ near.features[0, t, n, p * 9 + k]) for p in range(3)) / 4
+        assert float(out[0, t, n, k]) == pytest.approx(expected, abs=1e-5)
+    # The middle of the (x, z) window reads the splatted plane at the point's own x and z.
+    side = level.extra[0].shape[1]
+    inner = Planes(part)(level, torch.zeros(1, 2, 1, 3), cells[:, :, :1])
+    middle = (side - 1) / 2
+    low, high = int(np.floor(middle)), int(np.ceil(middle))
+    expected = level.extra[0][0, [low, low, high, high], [low, high, low, high]].mean(0)
+    torch.testing.assert_close(inner.features[0, 0, 0, 9 + 4], expected, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["p2n", "correlation", "planes"])
+def test_contexts_have_right_gradients(kind):
+    torch.manual_seed(0)
+    planes = kind == "planes"
+    part = config(
+        feature_dim=4,
+        token_dim=4,
+        context_head_dim=4,
+        context=kind,
+        space="uvlogd",
+        neighborhood="knn" if kind == "p2n" else "planes" if planes else "window",
+    )
+    context = {"p2n": P2N, "correlation": Correlation, "planes": PlaneCorrelation}[kind](part).double()
+    near, support = near_and_kept(generator(9), count=27 if planes else 9, channels=4, dtype=torch.float64)
+
+    def run(features, support_features):
+        kept = context.describe(0, Neighbors(support_features, support.points, support.center))
+        return context(0, kept, Neighbors(features, near.points, near.center))
+
+    inputs = near.features.requires_grad_(), support.features.requires_grad_()
+    assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("space", [UVLogD(), UVD()])
+def test_image_spaces_invert(space):
+    clip = t3d.simulate_clip(seed=1, frames=3, size=(48, 48), tracks=20)
+    k, e, d = (torch.from_numpy(x) for x in (clip.intrinsics, clip.extrinsics, clip.depths))
+    xyz = torch.from_numpy(clip.queries[:, 1:]).expand(3, -1, -1)
+    coords = space.from_world(xyz, k, e)
+    torch.testing.assert_close(space.to_world(coords, k, e, d), xyz, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(space.to_pixels(coords, k, e), t3d.geometry.project(xyz, k, e)[0])
+    cloud = space.lift(d, k, e)
+    world = space.to_world(cloud.flatten(1, 2), k, e, d).unflatten(1, (48, 48))
+    torch.testing.assert_close(world, torch.from_numpy(clip.points()), atol=1e-3, rtol=1e-4)
+
+
+def test_uv_is_lifted_by_the_depth_where_it_ends():
+    clip = t3d.simulate_clip(seed=1, frames=3, size=(48, 48), tracks=20)
+    k, e, d = (torch.from_numpy(x) for x in (clip.intrinsics, clip.extrinsics, clip.depths))
+    coords = torch.tensor([[[10.0, 12, 0], [30, 40, 0]]]).expand(3, -1, -1)
+    world = UV().to_world(coords, k, e, d)
+    torch.testing.assert_close(world[:, 0], torch.from_numpy(clip.points()[:, 12, 10]), atol=1e-4, rtol=1e-4)
+    holes = d.clone()
+    holes[:, 12, 10] = 0
+    assert torch.isfinite(UV().to_world(coords, k, e, holes)).all()
+
+
+SYSTEMS = {
+    "uvd": {"space": "uvd", "norm_mode": "anisotropy"},
+    "uvlogd": {"space": "uvlogd"},
+    "fixed neighbours in 2D": {"neighborhood": "window"},
+    "without N2N": {"context": "p2n"},
+    "CoTracker3-like": {"space": "uv", "neighborhood": "window", "context": "correlation"},
+    "DELTA-like": {"space": "uvlogd", "neighborhood": "window", "context": "correlation", "depth_ratio": True},
+    "SpatialTracker-like": {
+        "space": "uvd", "norm_mode": "anisotropy", "neighborhood": "planes", "context": "planes", "updater": "temporal"
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_system_of_the_paper_tracks_and_learns(name, tmp_path):
+    torch.manual_seed(0)
+    clip = t3d.simulate_clip(seed=2, frames=6, size=(48, 48), tracks=10)
+    tracker = t3d.Tracker(config(**SYSTEMS[name]))
+    tracks = tracker.eval().track(clip, support_grid=2)
+    assert np.isfinite(tracks.xyz).all()
+    # An untrained head hardly moves points, so a point starts where it was asked (uv: where its pixel's depth is).
+    own = tracks.xyz[clip.queries[:, 0].astype(int), np.arange(10)]
+    assert np.median(np.linalg.norm(own - clip.queries[:, 1:], axis=-1)) < 0.3
+    from tapip3d_lite.model.frames import frames_from_clip
+
+    frames = frames_from_clip(clip)
+    features = tracker.encoder(frames.rgb)
+    loss = sum(
+        s.coords.square().sum() for s in tracker.steps(frames, torch.from_numpy(clip.queries)[None], features=features)
+    )
+    loss.backward()
+    missing = [n for n, p in tracker.named_parameters() if p.grad is None and "vis_head" not in n]
+    assert missing == [], missing
+    t3d.save_weights(tracker, tmp_path / "w.safetensors")
+    again = t3d.load_weights(tmp_path / "w.safetensors").track(clip, support_grid=2)
+    np.testing.assert_array_equal(again.xyz, tracks.xyz)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"context": "correlation"}, "neighborhood='window'"),
+        ({"neighborhood": "window", "neighbors": 12}, "square"),
+        ({"neighborhood": "planes"}, "planes"),
+        ({"space": "uvd"}, "anisotropy"),
+        ({"space": "uv", "neighborhood": "planes", "context": "planes"}, "three axes"),
+        ({"depth_ratio": True}, "depth_ratio"),
+        ({"space": "moon"}, "space: expected one of"),
+    ],
+)
+def test_impossible_combinations_say_why(changes, message):
+    with pytest.raises(ValueError, match=message):
+        config(**changes)
+
+
+def test_temporal_updater_keeps_tracks_apart():
+    torch.manual_seed(0)
+    tracker = t3d.Tracker(config(updater="temporal")).eval()
+    clip = t3d.simulate_clip(seed=2, frames=6, size=(48, 48), tracks=10)
+    together = tracker.track(clip, support_grid=0)
+    alone = tracker.track(clip, clip.queries[:1], support_grid=0)
+    np.testing.assert_allclose(together.xyz[:, :1], alone.xyz, atol=1e-4)
