@@ -93,14 +93,13 @@ def _wrong_intrinsics(clip: Clip) -> Iterator[Finding]:
     elif offset > 0.1 and (point > 0).all():
         ratio = centre / point
         scaled = _with_intrinsics(ratio, 0.0)
-        likely = offset > 0.35 and np.ptp(np.log(ratio)) < 0.3  # a crop shifts the point, too: motion decides
+        # A crop shifts the point as well. Motion decides; without it only a point outside the image is proof.
+        likely = bool((point > (width, height)).any())
         if not _motion_prefers(clip, scaled(clip), likely):
             return
         size = np.rint(2 * point + 1).astype(int)
         message = f"intrinsics look made for a {size[0]}x{size[1]} image, the video is {width}x{height}"
         remedy = f"Multiply row 0 by {ratio[0]:.4g} and row 1 by {ratio[1]:.4g} (geometry.resize_intrinsics)."
-        if not _moves(clip):
-            remedy += " Not so if the frames are a crop off the centre, which a still camera cannot tell apart."
         name = "intrinsics_of_another_size"
     else:
         return

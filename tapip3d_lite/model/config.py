@@ -192,6 +192,8 @@ class TrackerConfig:
                 f"TrackerConfig: neighborhood {self.neighborhood!r} with context {self.context!r}: planes are read only by "
                 "the context 'planes', and it reads nothing else; set both or none"
             )
+        if self.space == "uv" and self.neighborhood == "planes":
+            raise ValueError("TrackerConfig: three planes need three axes, but space 'uv' has two; use 'uvd'")
         if self.context == "correlation" and self.neighborhood == "knn":
             raise ValueError(
                 "TrackerConfig: context 'correlation' compares cells place by place, and nearest neighbours have no places; "
@@ -208,8 +210,6 @@ class TrackerConfig:
                 "TrackerConfig: space 'uvd' mixes pixels and scene units, which have no common scale; "
                 "set norm_mode='anisotropy'"
             )
-        if self.space == "uv" and self.neighborhood == "planes":
-            raise ValueError("TrackerConfig: three planes need three axes, but space 'uv' has two; use 'uvd'")
 
 
 def callable_part(part: Any) -> bool:
