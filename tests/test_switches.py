@@ -254,3 +254,29 @@ def test_temporal_updater_keeps_tracks_apart():
     together = tracker.track(clip, support_grid=0)
     alone = tracker.track(clip, clip.queries[:1], support_grid=0)
     np.testing.assert_allclose(together.xyz[:, :1], alone.xyz, atol=1e-4)
+
+
+def invalid_share(holes, exclude):
+    """Share of invalid cells among the 12 nearest of visible true points at the coarsest of three levels."""
+    from dataclasses import replace
+
+    from tapip3d_lite.model.cloud import feature_cloud
+    from tapip3d_lite.model.frames import frames_from_clip
+    from tapip3d_lite.model.neighbors import knn
+    from tapip3d_lite.model.spaces import World
+
+    clip = t3d.simulate_clip(seed=4, frames=4)
+    lost = np.random.default_rng(0).random(clip.depths.shape) < holes
+    frames = frames_from_clip(replace(clip, depths=np.where(lost, 0, clip.depths), queries=None, tracks=None))
+    points = World().lift(frames.depths, frames.intrinsics, frames.extrinsics)
+    level = feature_cloud(torch.zeros(1, 4, 1, 32, 32), points, frames.depths > 0, 3)[-1]
+    valid = level.valid[0].flatten(1)
+    near = knn(torch.from_numpy(clip.tracks.xyz), level.points[0].flatten(1, 2), 12, valid if exclude else None)
+    bad = ~valid.gather(1, near.flatten(1)).view(near.shape)
+    return float(bad[torch.from_numpy(clip.tracks.visible)].float().mean())
+
+
+def test_invalid_cells_get_in_only_where_depth_is_sparse():
+    assert invalid_share(0.6, exclude=False) < 0.01  # they lie at the camera's centre, far from everything
+    assert invalid_share(0.9, exclude=False) > 0.3  # too few true cells are left to fill a neighbourhood
+    assert invalid_share(0.9, exclude=True) == 0

@@ -60,7 +60,9 @@ class TrackerConfig:
         levels: L, resolutions of the feature cloud.
         norm_mode: one standard deviation for all axes, one an axis, or no normalisation.
         norm_scale: standard deviation of the normalised cloud.
-        exclude_invalid: keep cells without depth out of the neighbourhoods; the released model leaves them in.
+        exclude_invalid: keep cells without depth out of the neighbourhoods; the released model leaves them in. They
+            lie at the camera's centre, so it matters only where depth is so sparse that K valid cells are not at hand;
+            there it is the better choice (measured in tests/test_switches.py).
         neighbors: K, cells in a neighbourhood, beside the query itself on the support side.
         token_dim: D, width of the neighbourhood tokens.
         context_heads, context_head_dim, context_mlp_ratio: attention inside the context.
