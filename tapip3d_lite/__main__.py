@@ -51,6 +51,28 @@ def _write(clip: t3d.Clip, result: t3d.Tracks, out: Path | None, html: Path | No
         print(f"wrote {png}")
 
 
+def evaluate(
+    clips: Positional[tuple[Path, ...]],
+    /,
+    tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("static", "klt"),
+    device: str = "cpu",
+) -> None:
+    """Score trackers on clips with true tracks; prints a Markdown table, one row a clip, then the means."""
+    from tqdm import tqdm
+
+    from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
+
+    rows, means = {}, {}
+    for name in tracker:
+        loaded = t3d.load_tracker(name, device=device)
+        scores = {}
+        for path in tqdm(clips, desc=name, leave=False, disable=None):
+            clip = t3d.load_clip(path)
+            scores[f"{name} · {clip.name}"] = t3d.evaluate(loaded.track(clip), clip)
+        rows, means = rows | scores, means | {f"{name} · mean": mean_scores(list(scores.values()))}
+    print(score_table(rows | means, ("AJ3D", "APD3D", "OA", "AJ3D_none", "APD3D_none", "AJ3D_none_dynamic")))
+
+
 def demo(
     clip: Positional[Path] = Path("data_samples/arc.npz"),
     /,
@@ -109,6 +131,7 @@ def picture(
 
 COMMANDS = {
     "track": track,
+    "evaluate": evaluate,
     "demo": demo,
     "check": check,
     "simulate": simulate,

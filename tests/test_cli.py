@@ -59,6 +59,16 @@ def test_track_on_a_grid(clip_file):
     assert "25 points" in result.stdout and "AJ3D" not in result.stdout
 
 
+def test_evaluate_prints_a_table_with_means(clip_file):
+    result = call("evaluate", clip_file, "--tracker", "static", "klt")
+    assert result.returncode == 0, result.stderr
+    lines = result.stdout.strip().splitlines()
+    clip = t3d.load_clip(clip_file)
+    expected = t3d.evaluate(t3d.load_tracker("static").track(clip), clip)["AJ3D"]
+    assert lines[2].split("|")[2].strip() == f"{expected:.3f}"
+    assert [line.split("|")[1].strip() for line in lines[-2:]] == ["static · mean", "klt · mean"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -67,6 +77,7 @@ def test_track_on_a_grid(clip_file):
         (["track", "CLIP", "--no-own-queries", "--grid", "0"], "grid_queries"),
         (["simulate", "--out", "x", "--count", "0"], "count"),
         (["picture", "PLAIN"], "no true tracks"),
+        (["evaluate", "PLAIN"], "no true tracks"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(clip_file, tmp_path, arguments, message):
