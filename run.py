@@ -20,33 +20,30 @@ ROOT = Path(__file__).resolve().parent
 VENV = ROOT / ".venv"
 PYTHON = VENV / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 STAMP = VENV / "installed.sha256"
+COMMANDS = {
+    "setup": "make or update the environment, nothing else",
+    "lab": "start JupyterLab on the notebooks; options are passed on, e.g. --no-browser --port 9000",
+    "test": "style, unit tests, then every notebook on the CPU; arguments go to pytest, and then notebooks are left out",
+    "demo": "track a sample clip, write a 3D page and a picture; arguments as for `python -m tapip3d_lite demo`",
+    "notebooks": "run the notebooks and store their fresh outputs; names select some, e.g. 01_lifting",
+}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True, metavar="setup | lab | test | demo | notebooks")
-    commands.add_parser("setup", help="make or update the environment, nothing else")
-    lab = commands.add_parser("lab", help="start JupyterLab on the notebooks")
-    lab.add_argument(
-        "arguments", nargs=argparse.REMAINDER, help="passed on to JupyterLab, e.g. --no-browser --port 9000"
-    )
-    test = commands.add_parser("test", help="style, unit tests, then every notebook on the CPU")
-    test.add_argument(
-        "arguments", nargs=argparse.REMAINDER, help="passed on to pytest (then the notebooks are left out)"
-    )
-    demo = commands.add_parser("demo", help="track a sample clip, write a 3D page and a picture")
-    demo.add_argument(
-        "arguments", nargs=argparse.REMAINDER, help="CLIP.npz and options of `python -m tapip3d_lite demo`"
-    )
-    notebooks = commands.add_parser("notebooks", help="run the notebooks and store their fresh outputs")
-    notebooks.add_argument("arguments", nargs=argparse.REMAINDER, help="names, e.g. 01_lifting; default: all")
-    chosen = parser.parse_args()
+    for name, text in COMMANDS.items():
+        commands.add_parser(name, help=text, description=text)
+    # Everything behind the command belongs to the program it starts: JupyterLab, pytest, tapip3d_lite.
+    chosen, arguments = parser.parse_known_args()
+    if chosen.command == "setup" and arguments:
+        parser.error(f"setup takes no arguments, got {' '.join(arguments)}")
     if sys.version_info < (3, 10):  # noqa: UP036 (run.py is what an older Python meets first)
         print(f"Python 3.10 or newer is needed, this is {sys.version.split()[0]}; try python3.11 run.py …")
         return 2
     try:
         setup()
-        return globals()[f"run_{chosen.command}"](*getattr(chosen, "arguments", []))
+        return globals()[f"run_{chosen.command}"](*arguments)
     except subprocess.CalledProcessError as error:
         print(f"run.py: this step failed with exit code {error.returncode}: {' '.join(map(str, error.cmd))}")
         return 1

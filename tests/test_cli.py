@@ -119,4 +119,28 @@ def test_run_py_explains_itself_without_installing():
     result = subprocess.run([sys.executable, str(ROOT / "run.py"), "--help"], capture_output=True, text=True)
     assert result.returncode == 0
     assert all(word in result.stdout for word in ("setup", "lab", "test", "demo", "notebooks"))
-    assert subprocess.run([sys.executable, str(ROOT / "run.py"), "fly"], capture_output=True).returncode == 2
+    for wrong in (["fly"], ["setup", "--fast"]):
+        assert subprocess.run([sys.executable, str(ROOT / "run.py"), *wrong], capture_output=True).returncode == 2
+
+
+def test_run_py_passes_options_on(monkeypatch):
+    sys.path.insert(0, str(ROOT))
+    try:
+        import run
+    finally:
+        sys.path.remove(str(ROOT))
+    calls = []
+    monkeypatch.setattr(run, "setup", lambda: None)
+    monkeypatch.setattr(run, "_call", lambda *arguments: calls.append(arguments) or 0)
+    for line in (
+        "run.py test -k cut --maxfail=1",
+        "run.py lab --no-browser --port 9000",
+        "run.py demo clip.npz",
+        "run.py test",
+    ):
+        monkeypatch.setattr(sys, "argv", line.split())
+        assert run.main() == 0
+    assert calls[0] == ("-m", "pytest", "-k", "cut", "--maxfail=1")
+    assert calls[1][-3:] == ("--no-browser", "--port", "9000")
+    assert calls[2] == ("-m", "tapip3d_lite", "demo", "clip.npz")
+    assert len(calls) == 5  # all tests: unit tests, then notebooks
