@@ -94,6 +94,8 @@ def test_exercises_are_whole(path):
 @each_notebook
 def test_solutions_pass(path):
     nb = run(solution_copy(read(path)))
+    warned = [o.text for _, o in outputs(nb) if o.get("name") == "stderr" and "Warning" in o.text]
+    assert not warned, warned[0]  # `clean` would hide it from the stored notebook
     checkers = [c for c in code_cells(nb) if "exercises.check(" in c.source]
     assert len(checkers) == sum("exercise" in tags(c) for c in nb.cells)
     for cell in checkers:
@@ -115,7 +117,9 @@ def small():
         "<details><summary>Hint 1</summary>\n\n```python\nno\n```\n\n</details>\n\n<details><summary>Solution</summary>"
     )
     cells = [
-        nbformat.v4.new_code_cell("def f():\n    ...", metadata={"tags": ["exercise"], "execution": {"started": "now"}}),
+        nbformat.v4.new_code_cell(
+            "def f():\n    ...", metadata={"tags": ["exercise"], "execution": {"started": "now"}}
+        ),
         nbformat.v4.new_code_cell(
             "import sys; print(f()); print('/home/me/x/notebooks/a.png'); print('w', file=sys.stderr)"
         ),
@@ -133,6 +137,11 @@ def test_a_solution_copy_runs_the_folded_code_and_leaves_the_stub_alone(small):
     del small.cells[2]
     with pytest.raises(ValueError, match="no folded solution"):
         solution_copy(small)
+
+
+def test_printed_text_is_stored_in_one_piece(small):
+    small.cells[1].outputs = [nbformat.v4.new_output("stream", name="stdout", text=t) for t in ("a\n", "b\n")]
+    assert [o.text for o in clean(small).cells[1].outputs] == ["a\nb\n"]
 
 
 def test_a_stored_scene_and_explorer_leave_their_text(small):

@@ -59,7 +59,8 @@ class show_3d:
 
     def bundles(self) -> list[dict[str, object]]:
         """The two outputs, each as MIME type to content."""
-        note = f"3D scene with {len(self.figure.frames)} frames: run the cell in JupyterLab to turn it"
+        span = f" with {len(self.figure.frames)} frames" if self.figure.frames else ""
+        note = f"3D scene{span}: run the cell in JupyterLab to turn it"
         scene = {"application/vnd.plotly.v1+json": json.loads(self.figure.to_json()), "text/plain": note}
         return [scene, {"image/png": png_bytes(self.twin), "text/plain": "the static twin"}]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from tapip3d_lite.geometry import invert, resize_intrinsics, transform, unproject
@@ -175,4 +177,48 @@ NEAREST = Exercise(
     ),
 )
 
-EXERCISES = (UNPROJECT, TO_WORLD, RESIZE, NEAREST)
+
+def _point_maps(rng: np.random.Generator, size: int) -> tuple:
+    height, width = size, size + 1
+    sides = rng.integers(2, 5, 2)
+    return rng.normal(size=(height * sides[0], width * sides[1], 3)), (height, width)
+
+
+def point_level(points: Array, cells: tuple[int, int], index: Callable[[int, int], Array] = nearest_cells) -> Array:
+    """One level (h, w, 3) of the point pyramid: of a point map (H, W, 3), the pixel nearest to each cell's middle."""
+    return points[index(len(points), cells[0])][:, index(points.shape[1], cells[1])]
+
+
+def _averaged(points: Array, cells: tuple[int, int]) -> Array:
+    return points.reshape(cells[0], len(points) // cells[0], cells[1], -1, 3).mean((1, 3))
+
+
+LEVEL = Exercise(
+    "01.point_level",
+    reference=point_level,
+    cases=_point_maps,
+    mistakes=(
+        Mistake(
+            "averaged",
+            _averaged,
+            "you averaged: the mean of a front and a back point lies on neither. Pick one pixel for each cell.",
+        ),
+        Mistake(
+            "corner pixel",
+            lambda p, cells: point_level(p, cells, lambda n, m: np.arange(m) * n // m),
+            "you pick each cell's first pixel; its middle lies half a cell further on.",
+        ),
+        Mistake(
+            "rows paired with columns",
+            lambda p, cells: p[nearest_cells(len(p), cells[0]), nearest_cells(p.shape[1], cells[1])],
+            "points[rows, columns] pairs the two lists; points[rows][:, columns] takes every column of every row.",
+        ),
+        Mistake(
+            "corners aligned",
+            lambda p, cells: point_level(p, cells, lambda n, m: np.rint(np.linspace(0, n - 1, m)).astype(int)),
+            "you aligned the corner cells with the corner pixels; every cell covers H / h by W / w pixels instead.",
+        ),
+    ),
+)
+
+EXERCISES = (UNPROJECT, TO_WORLD, RESIZE, NEAREST, LEVEL)
