@@ -7,6 +7,7 @@ import torch
 import tapip3d_lite as t3d
 from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.model.recorder import Recorder
+from tests.test_switches import SYSTEMS
 
 SMALL = {"image_size": (48, 48), "window": 4, "levels": 2, "neighbors": 4, "iterations": 2}
 
@@ -62,12 +63,35 @@ def test_stream_equals_offline(tracker, clip, space, frames):
         np.testing.assert_array_equal(updates[-1].xyz, result.xyz[-4:])
 
 
-def test_stream_in_pixel_space(clip):
+@pytest.mark.parametrize("name", ["uvd", "CoTracker3-like", "SpatialTracker-like"])
+def test_stream_of_other_systems(clip, name):
     torch.manual_seed(0)
-    tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **SMALL, space="uv", neighborhood="window")).eval()
+    tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **(SMALL | {"neighbors": 9} | SYSTEMS[name]))).eval()
     stream = tracker.stream(clip.queries)
     feed(stream, clip)
-    np.testing.assert_allclose(stream.finish().xyz, offline_frame_by_frame(tracker, clip)[0], atol=1e-5)
+    np.testing.assert_allclose(stream.finish().xyz, offline_frame_by_frame(tracker, clip)[0], atol=1e-4)
+
+
+def test_stream_with_a_support_grid_does_not_tell_it(tracker, clip):
+    """The grid is attended to like queries of the user's on the first frame, and left out."""
+    stream, grid = tracker.stream(clip.queries, support_grid=3), t3d.grid_queries(clip, 3)
+    updates = feed(stream, clip)
+    both = tracker.stream(np.concatenate([clip.queries, grid]))
+    feed(both, clip)
+    result, other, alone = stream.finish(), both.finish(), tracker.stream(clip.queries)
+    assert updates[0].xyz.shape == (4, 24, 3) and result.xyz.shape == (11, 24, 3)
+    np.testing.assert_array_equal(result.xyz, other.xyz[:, :24])
+    feed(alone, clip)
+    assert np.abs(alone.finish().xyz - result.xyz).max() > 1e-6
+
+
+def test_queries_of_the_future_stand_at_their_query(tracker, clip):
+    rows = clip.queries.copy()
+    rows[:, 0] = [0] * 12 + [9] * 12
+    stream = tracker.stream(rows, space="camera")
+    first = next(iter(feed(stream, clip.cut(0, 5))))
+    np.testing.assert_array_equal(first.xyz[:, 12:], np.broadcast_to(rows[12:, 1:], (4, 12, 3)))
+    assert not first.visible[:, 12:].any()
 
 
 def test_stream_without_frames_or_with_a_bad_frame(tracker, clip):
@@ -75,6 +99,24 @@ def test_stream_without_frames_or_with_a_bad_frame(tracker, clip):
     assert stream.finish().xyz.shape == (0, 24, 3)
     with pytest.raises(ValueError, match=r"Clip\.depths"):
         stream.push(clip.video[0], clip.depths[0][:-1], clip.intrinsics[0], clip.extrinsics[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"queries": np.zeros((2, 3))}, "queries: expected shape"),
+        ({"queries": [[0.5, 0, 0, 1]]}, "whole frame number"),
+        ({"queries": [[-1.0, 0, 0, 1]]}, "whole frame number"),
+        ({"queries": [[0, np.nan, 0, 1]]}, "finite"),
+        ({"depth_roi": "auto"}, "does not know the whole clip"),
+        ({"space": "uvd"}, "only camera and world"),
+        ({"iterations": 0}, "iterations"),
+        ({"visible_threshold": 2}, "probability"),
+    ],
+)
+def test_bad_options_of_a_stream(tracker, clip, options, message):
+    with pytest.raises(ValueError, match=message):
+        tracker.stream(**({"queries": clip.queries} | options))
 
 
 def test_recorder_shows_what_was_computed(tracker, clip):
@@ -112,9 +154,40 @@ def test_recorder_shows_what_was_computed(tracker, clip):
     assert len(record.steps) == before  # the hooks are gone
 
 
-def test_recorder_with_another_context(clip):
-    tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **SMALL, context="p2n")).eval()
+@torch.no_grad()
+def test_recorder_counts_queries_not_members_of_a_window(tracker, clip):
+    rows = clip.queries[:3].copy()
+    rows[:, 0] = 9, 0, 4  # the first is in no window but the last ones
+    frames = frames_from_clip(clip)
+    with Recorder(tracker, [2, 0]) as record:
+        steps = list(tracker.steps(frames, torch.from_numpy(rows)[None], iterations=1))
+    assert [step.columns for step in record.steps] == [[], [2], [2], [2, 0], [2, 0]]
+    assert [step.start for step in record.steps] == [0, 2, 4, 6, 8]
+    for seen, step in zip(record.steps, steps, strict=True):
+        places = [step.columns.tolist().index(column) for column in seen.columns]
+        torch.testing.assert_close(seen.xyz, step.xyz[0, :, places])
+        torch.testing.assert_close(seen.logits, step.logits[0, :, places])
+        for level in seen.levels:
+            assert level.support.indices[:, 0].tolist() == [-1] * len(seen.columns)
+            cells = level.near.indices  # the recorded cells are those around the estimate
+            assert cells.shape == (4, len(seen.columns), 4) and int(cells.min() if cells.numel() else 0) >= 0
+
+
+def test_recorder_leaves_the_tracker_as_it_was_even_after_an_error(tracker, clip):
+    with pytest.raises(RuntimeError, match="stop"), Recorder(tracker, [0]):
+        raise RuntimeError("stop")
+    assert "update" not in vars(tracker)
+
+
+@pytest.mark.parametrize("context", ["p2n", "correlation"])
+def test_recorder_with_another_context(clip, context):
+    changes = SMALL | {"context": context, "neighborhood": "knn" if context == "p2n" else "window"}
+    tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **changes)).eval()
     with Recorder(tracker, [0]) as record:
         tracker.track(clip, support_grid=0)
-    assert record.steps[0].levels[0].support_from_context is None
-    assert record.steps[0].levels[0].near.points.shape == (4, 1, 4, 3)
+    level = record.steps[0].levels[0]
+    assert level.support_from_context is None
+    assert level.near.points.shape == (4, 1, 4, 3) and level.support.points.shape == (1, 5, 3)
+    if context == "p2n":
+        assert level.query_from_context.shape == (4, 1, 4)
+        torch.testing.assert_close(level.query_from_context.sum(-1), torch.ones(4, 1))

@@ -34,18 +34,39 @@ def random_level(g, shape=(1, 2, 5, 7), channels=3):
     )
 
 
-def test_window_is_the_loop_and_clamps_at_borders():
+def naive_window(cell, count, height, width):
+    """The smallest square of cells with `count` of them, without those farthest from its centre; row by row."""
+    side = int(np.ceil(np.sqrt(count)))
+    steps = [(dv - (side - 1) / 2, du - (side - 1) / 2) for dv, du in product(range(side), repeat=2)]
+    kept = sorted(sorted(range(len(steps)), key=lambda i: steps[i][0] ** 2 + steps[i][1] ** 2)[:count])
+    for dv, du in (steps[i] for i in kept):
+        u, v = (
+            min(max(int(np.floor(x + d + 0.5)), 0), n - 1)
+            for x, d, n in zip(cell, (du, dv), (width, height), strict=True)
+        )
+        yield dv**2 + du**2, v * width + u
+
+
+@pytest.mark.parametrize("exclude", [False, True])
+@pytest.mark.parametrize("count", [9, 12, 16, 32])
+def test_window_is_the_loop_and_clamps_at_borders(count, exclude):
     level = random_level(generator())
-    cells = torch.tensor([[2.2, 1.7], [-3.0, 9.0], [6.4, 0.4]]).expand(1, 2, 3, 2)
-    coords = torch.randn(1, 2, 3, 3, generator=generator(1))
-    near = Window(config(neighborhood="window"))(level, coords, cells)
-    for t, n in product(range(2), range(3)):
-        for k, (dv, du) in enumerate(product((-1, 0, 1), (-1, 0, 1))):
-            u = int(np.clip(np.rint(cells[0, t, n, 0].item() + du), 0, 6))
-            v = int(np.clip(np.rint(cells[0, t, n, 1].item() + dv), 0, 4))
-            assert near.indices[0, t, n, k] == v * 7 + u
-            torch.testing.assert_close(near.features[0, t, n, k], level.features[0, t, v, u])
-            torch.testing.assert_close(near.offsets[0, t, n, k], level.points[0, t, v, u] - coords[0, t, n])
+    if exclude:
+        level.valid[0, 1] = False  # a frame without depth keeps its cells
+    cells = torch.tensor([[2.2, 1.7], [3.0, 2.0], [-3.0, 9.0], [6.4, 0.4]]).expand(1, 2, 4, 2)
+    coords = torch.randn(1, 2, 4, 3, generator=generator(1))
+    part = config(neighborhood="window", neighbors=count, exclude_invalid=exclude)
+    near = Window(part)(level, coords, cells)
+    features, points, valid = level.features.flatten(2, 3), level.points.flatten(2, 3), level.valid.flatten(2, 3)
+    for t, n in product(range(2), range(4)):
+        pairs = list(naive_window(cells[0, t, n].tolist(), count, 5, 7))
+        fine = [i for _, i in sorted(pairs, key=lambda pair: pair[0]) if valid[0, t, i]]
+        expected = [i if not exclude or valid[0, t, i] or not fine else fine[0] for _, i in pairs]
+        assert near.indices[0, t, n].tolist() == expected
+        torch.testing.assert_close(near.features[0, t, n], features[0, t, expected])
+        torch.testing.assert_close(near.offsets[0, t, n], points[0, t, expected] - coords[0, t, n])
+    inner = near.indices[0, 0, 1].tolist()
+    assert exclude or count > 16 or len(set(inner)) == count  # no cell twice, also where the projection is a cell
 
 
 def test_window_interpolates_for_correlation():
@@ -168,40 +189,60 @@ def test_contexts_have_right_gradients(kind):
     assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("space", [UVLogD(), UVD()])
+def cameras_of(clip):
+    return [torch.from_numpy(x) for x in (clip.intrinsics, clip.extrinsics, clip.depths)]
+
+
+@pytest.mark.parametrize("space", ["uvlogd", "uvd", "uvd as it is"])
 def test_image_spaces_invert(space):
     clip = t3d.simulate_clip(seed=1, frames=3, size=(48, 48), tracks=20)
-    k, e, d = (torch.from_numpy(x) for x in (clip.intrinsics, clip.extrinsics, clip.depths))
+    k, e, d = cameras_of(clip)
+    space = {"uvlogd": UVLogD(), "uvd": UVD().fit(d[:1]), "uvd as it is": UVD()}[space]
     xyz = torch.from_numpy(clip.queries[:, 1:]).expand(3, -1, -1)
-    coords = space.from_world(xyz, k, e)
-    torch.testing.assert_close(space.to_world(coords, k, e, d), xyz, atol=1e-4, rtol=1e-4)
+    coords = space.from_world(xyz[None], k[None], e[None])[0]
+    torch.testing.assert_close(space.to_world(coords[None], k[None], e[None], d[None])[0], xyz, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(space.to_pixels(coords, k, e), t3d.geometry.project(xyz, k, e)[0])
-    cloud = space.lift(d, k, e)
-    world = space.to_world(cloud.flatten(1, 2), k, e, d).unflatten(1, (48, 48))
+    cloud = space.lift(d[None], k[None], e[None])[0]
+    world = space.to_world(cloud[None].flatten(2, 3), k[None], e[None], d[None])[0].unflatten(1, (48, 48))
     torch.testing.assert_close(world, torch.from_numpy(clip.points()), atol=1e-3, rtol=1e-4)
 
 
-def test_uv_is_lifted_by_the_depth_where_it_ends():
+def test_uvd_stretches_each_clips_depth_to_the_width_whatever_the_unit():
+    depths = torch.rand(2, 20, 30, generator=generator(2)) * 3 + 1
+    depths[1] *= 1000
+    depths[:, :3] = 0  # holes
+    depths[:, 4, :2] = 1e6  # a little sky does not count
+    space = UVD().fit(depths)
+    third = space.lift(depths[:, None], torch.eye(3).expand(2, 1, 3, 3), torch.eye(4))[..., 2]
+    inside = (depths > 0) & (depths < 1e5)
+    for b in range(2):
+        values = third[b, 0][inside[b]]
+        assert float(values.min()) == pytest.approx(0, abs=1e-2)
+        assert float(values.max()) == pytest.approx(30, abs=1)
+    empty = UVD().fit(torch.zeros(1, 4, 4))
+    assert torch.isfinite(empty.lift(torch.zeros(1, 1, 4, 4), torch.eye(3), torch.eye(4))).all()
+
+
+def test_uv_is_lifted_by_the_depth_where_it_ends_and_holes_by_the_nearest_depth():
     clip = t3d.simulate_clip(seed=1, frames=3, size=(48, 48), tracks=20)
-    k, e, d = (torch.from_numpy(x) for x in (clip.intrinsics, clip.extrinsics, clip.depths))
-    coords = torch.tensor([[[10.0, 12, 0], [30, 40, 0]]]).expand(3, -1, -1)
+    k, e, d = cameras_of(clip)
+    coords = torch.tensor([[[10.2, 11.8, 0], [30, 40, 0], [60, -9, 0]]]).expand(3, -1, -1)
+    d[:, 38:43, 28:33] = 0
+    d[:, 40, 32] = 7.5
     world = UV().to_world(coords, k, e, d)
-    torch.testing.assert_close(world[:, 0], torch.from_numpy(clip.points()[:, 12, 10]), atol=1e-4, rtol=1e-4)
-    holes = d.clone()
-    holes[:, 12, 10] = 0
-    assert torch.isfinite(UV().to_world(coords, k, e, holes)).all()
+    z = torch.stack([d[:, 12, 10], torch.full((3,), 7.5), d[:, 0, 47]], -1)
+    torch.testing.assert_close(world, t3d.geometry.unproject(coords[..., :2], z, k, e), atol=1e-5, rtol=1e-5)
+    assert torch.isfinite(UV().to_world(coords * torch.nan, k, e, d * 0)).sum() == 0  # NaN in, NaN out, no crash
 
 
 SYSTEMS = {
-    "uvd": {"space": "uvd", "norm_mode": "anisotropy"},
+    "uvd": {"space": "uvd", "neighbors": 12},
     "uvlogd": {"space": "uvlogd"},
-    "fixed neighbours in 2D": {"neighborhood": "window"},
-    "without N2N": {"context": "p2n"},
+    "fixed neighbours in 2D": {"neighborhood": "window", "neighbors": 12},
+    "without N2N": {"context": "p2n", "space": "camera"},
     "CoTracker3-like": {"space": "uv", "neighborhood": "window", "context": "correlation"},
     "DELTA-like": {"space": "uvlogd", "neighborhood": "window", "context": "correlation", "depth_ratio": True},
-    "SpatialTracker-like": {
-        "space": "uvd", "norm_mode": "anisotropy", "neighborhood": "planes", "context": "planes", "updater": "temporal"
-    },
+    "SpatialTracker-like": {"space": "uvd", "neighborhood": "planes", "context": "planes", "updater": "temporal"},
 }  # fmt: skip
 
 
@@ -234,11 +275,15 @@ def test_every_system_of_the_paper_tracks_and_learns(name, tmp_path):
     ("changes", "message"),
     [
         ({"context": "correlation"}, "neighborhood='window'"),
-        ({"neighborhood": "window", "neighbors": 12}, "square"),
         ({"neighborhood": "planes"}, "planes"),
-        ({"space": "uvd"}, "anisotropy"),
+        ({"context": "planes", "neighborhood": "window"}, "planes"),
+        ({"use_features": True, "context": "p2n"}, "use_features"),
         ({"space": "uv", "neighborhood": "planes", "context": "planes"}, "three axes"),
         ({"depth_ratio": True}, "depth_ratio"),
+        (
+            {"depth_ratio": True, "neighborhood": "window", "context": "correlation", "space": "world"},
+            "third axis is depth",
+        ),
         ({"space": "moon"}, "space: expected one of"),
     ],
 )
@@ -280,3 +325,51 @@ def test_invalid_cells_get_in_only_where_depth_is_sparse():
     assert invalid_share(0.6, exclude=False) < 0.01  # they lie at the camera's centre, far from everything
     assert invalid_share(0.9, exclude=False) > 0.3  # too few true cells are left to fill a neighbourhood
     assert invalid_share(0.9, exclude=True) == 0
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_rigid_motion_of_scene_and_cameras_moves_the_tracks_with_it(name):
+    torch.manual_seed(0)
+    tracker = t3d.Tracker(config(**SYSTEMS[name])).eval()
+    torch.nn.init.normal_(tracker.updater.head.weight, std=0.002)
+    clip = t3d.simulate_clip(seed=2, frames=6, size=(48, 48), tracks=10)
+    pose = np.eye(4)
+    # In the world only a translation: attention sees offsets by their axes.
+    if tracker.config.space != "world":
+        rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+        pose[:3, :3] = rotation * np.linalg.det(rotation)
+    pose[:3, 3] = 0.5, -0.25, 1
+    pose = pose.astype(np.float32)
+    queries = np.concatenate([clip.queries[:, :1], t3d.geometry.transform(clip.queries[:, 1:], pose)], 1)
+    moved = t3d.Clip(clip.video, clip.depths, clip.intrinsics, clip.extrinsics @ t3d.geometry.invert(pose))
+    options = {"support_grid": 0, "bidirectional": False}
+    before, after = tracker.track(clip, clip.queries, **options), tracker.track(moved, queries, **options)
+    motion = np.linalg.norm(before.xyz - clip.queries[:, 1:], axis=-1)
+    error = np.linalg.norm(after.xyz - t3d.geometry.transform(before.xyz, pose[None]), axis=-1)
+    # Random weights amplify a rounded coordinate some hundred times, and in uv one of two equally near pixels is read;
+    # in a window a cell on the edge is in or out. The motion of the scene itself is a metre.
+    assert np.median(motion) > 0.05
+    assert np.median(error) < 5e-3 * np.median(motion)
+    assert np.quantile(error, 0.9) < 0.1 * np.median(motion)
+
+
+class Slow(torch.nn.Module):
+    """An updater of one layer that looks at each token alone."""
+
+    def __init__(self, config, inputs):
+        super().__init__()
+        self.layer = torch.nn.Linear(inputs, 4)
+
+    def forward(self, tokens, active=None):
+        return self.layer(tokens) * 1e-3
+
+
+def test_a_custom_updater_and_a_function_for_one():
+    clip = t3d.simulate_clip(seed=2, frames=6, size=(48, 48), tracks=10)
+    tracker = t3d.Tracker(config(updater=Slow))
+    assert np.isfinite(tracker.track(clip, support_grid=0).xyz).all()
+    still = t3d.Tracker(config(updater=lambda tokens, active=None: tokens[..., :4] * 0)).track(clip, support_grid=0)
+    np.testing.assert_allclose(still.xyz, np.broadcast_to(clip.queries[:, 1:], still.xyz.shape), atol=1e-5)
+    with pytest.raises(ValueError, match="custom part"):
+        tracker.config.to_dict()

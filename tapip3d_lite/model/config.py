@@ -201,16 +201,14 @@ class TrackerConfig:
                 "TrackerConfig: context 'correlation' compares cells place by place, and nearest neighbours have no places; "
                 "set neighborhood='window'"
             )
-        if self.neighborhood in ("window", "planes") and round(self.neighbors**0.5) ** 2 != self.neighbors:
+        if self.depth_ratio and (self.context != "correlation" or self.space in ("uv", "world")):
             raise ValueError(
-                f"TrackerConfig.neighbors: a window is square, so K must be 9, 25, 49, …; got {self.neighbors}"
+                "TrackerConfig.depth_ratio: only the context 'correlation' reads it, and only where the third axis is depth, "
+                "that is in the spaces 'uvd', 'uvlogd' and 'camera'"
             )
-        if self.depth_ratio and (self.context != "correlation" or self.space == "uv"):
-            raise ValueError("TrackerConfig.depth_ratio: only context 'correlation' in a space with depth reads it")
-        if self.space == "uvd" and self.norm_mode == "isotropic":
+        if self.use_features and self.context in ("p2n", "correlation", "planes"):
             raise ValueError(
-                "TrackerConfig: space 'uvd' mixes pixels and scene units, which have no common scale; "
-                "set norm_mode='anisotropy'"
+                f"TrackerConfig.use_features: only the context 'n2n' appends the query's feature, not {self.context!r}"
             )
 
 

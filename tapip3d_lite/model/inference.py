@@ -54,7 +54,7 @@ def track(
     Raises:
         ValueError: queries outside the clip, a space that the model was not made for, or a bad option.
     """
-    _check_options(tracker, space, depth_roi, visible_threshold, support_grid)
+    check_options(tracker, space, depth_roi, visible_threshold, support_grid)
     queries = resolve_queries(clip, queries)
     clip = resize_clip(clip, tracker.config.image_size)
     frames = frames_from_clip(clip, device=next(tracker.parameters()).device)
@@ -106,7 +106,8 @@ def _bar(show: bool, tracker: nn.Module, frames: int, iterations: int | None, pa
     return tqdm(total=total, disable=not show, desc="tracking")
 
 
-def _check_options(tracker: nn.Module, space: Any, roi: Any, threshold: float, grid: int) -> None:
+def check_options(tracker: nn.Module, space: Any, roi: Any, threshold: float, grid: int) -> None:
+    """ValueError where an option of `track` cannot be honoured."""
     own = tracker.config.space
     if space not in (None, own) and not (own in _INTERCHANGEABLE and space in _INTERCHANGEABLE):
         raise ValueError(

@@ -1,7 +1,7 @@
 """Look inside a tracker at work: neighbourhoods, attention, tokens and the path after every update.
 
-Forward hooks watch the tracker's parts from outside, so the tracker itself carries no flags and is as fast as ever
-when nobody looks.
+A recorder stands around `Tracker.update` and computes anew, for a few tracks, what happens inside; so the tracker
+carries no flags, keeps nothing, and is as fast as ever when nobody looks.
 
     with Recorder(tracker, columns=[0, 5]) as record:
         tracker.track(clip)
@@ -11,36 +11,40 @@ when nobody looks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.model.contexts import N2N
+from tapip3d_lite.model.contexts import N2N, P2N
 from tapip3d_lite.model.neighbors import Neighbors
+from tapip3d_lite.model.scene import Window, to_world
 
 
 @dataclass
 class LevelRecord:
-    """What happened at one level; n chosen queries, S frames. Attention is averaged over heads.
+    """What happened at one level; n chosen tracks, S frames. Attention is averaged over heads.
 
     Attributes:
-        near: context neighbourhoods (S, n, K, ...), normalised coordinates.
+        near: context neighbourhoods (S, n, K, ...), normalised coordinates; `indices` are cells of the frame.
+        support: neighbourhoods in the query frame (n, 1 + K, ...), normalised; the query itself first, with index -1.
         support_from_context: (S, n, K + 1, K), how support tokens look at context tokens.
         context_from_support: (S, n, K, K + 1).
         pool_support: (S, n, K + 1), weights of the pooling.
         pool_context: (S, n, K).
-        support_tokens: (n, K + 1, D).
+        query_from_context: (S, n, K), in a tracker with the context `p2n`.
+        support_tokens: (n, K + 1, D); of `p2n` the query's alone.
         context_tokens: (S, n, K, D).
     """
 
     near: Neighbors
+    support: Neighbors
     support_from_context: Tensor | None = None
     context_from_support: Tensor | None = None
     pool_support: Tensor | None = None
     pool_context: Tensor | None = None
+    query_from_context: Tensor | None = None
     support_tokens: Tensor | None = None
     context_tokens: Tensor | None = None
 
@@ -50,16 +54,24 @@ class StepRecord:
     """One update of one window.
 
     Attributes:
+        start: the window's first frame, counted in the direction of the pass.
+        columns: (n,) which of the chosen tracks this window contains.
         levels: one record a level.
         tokens: (S, n, width) trajectory tokens.
         coords: (S, n, 3) the estimate before the update, normalised.
         moved: (S, n, 3) the correction.
+        logits: (S, n) visibility after the update.
+        xyz: (S, n, 3) the estimate after the update, world.
     """
 
-    levels: list[LevelRecord] = field(default_factory=list)
-    tokens: Tensor | None = None
-    coords: Tensor | None = None
-    moved: Tensor | None = None
+    start: int
+    columns: list[int]
+    levels: list[LevelRecord]
+    tokens: Tensor
+    coords: Tensor
+    moved: Tensor
+    logits: Tensor
+    xyz: Tensor
 
 
 class Recorder:
@@ -67,77 +79,88 @@ class Recorder:
 
     Args:
         tracker: the tracker to watch.
-        columns: which tracks, counted among those of a window (all of a clip's queries are in its last window, in
-            their order, before the support grid).
+        columns: which tracks: rows of the queries. A window that does not contain one yet records the others.
     """
 
     def __init__(self, tracker: nn.Module, columns: Sequence[int]) -> None:
         self.tracker, self.columns = tracker, list(columns)
         self.steps: list[StepRecord] = []
-        self._parts: list[list[tuple]] = []
-        self._handles: list[Any] = []
 
     def __enter__(self) -> Recorder:
-        tracker = self.tracker
-        self._parts = [[] for _ in range(tracker.config.levels)]
-        self._handles = [
-            tracker.context.register_forward_hook(self._see_context),
-            tracker.updater.register_forward_hook(self._see_update),
-        ]
+        self._update = self.tracker.update
+        self.tracker.update = self._watch
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for handle in self._handles:
-            handle.remove()
+        del self.tracker.update
 
-    def _see_context(self, module: nn.Module, inputs: tuple, output: Tensor) -> None:
-        index, kept, near = inputs
-        self._parts[index].append((kept.detach(), near))
+    def _watch(self, window: Window, coords: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
+        tokens: list[Tensor] = []
+        handle = self.tracker.updater.register_forward_pre_hook(lambda _, inputs: tokens.append(inputs[0]))
+        try:
+            after = self._update(window, coords, logits)
+        finally:
+            handle.remove()
+        self._record(window, coords, after, tokens[0])
+        return after
 
     @torch.no_grad()
-    def _see_update(self, module: nn.Module, inputs: tuple, output: Tensor) -> None:
-        step = StepRecord()
-        for index, parts in enumerate(self._parts):
-            kept = torch.cat([kept for kept, _ in parts], 1)
-            near = _joined([near for _, near in parts])
-            chosen = [c for c in self.columns if c < kept.shape[1]]
-            step.levels.append(self._level(index, kept[0, chosen], _chosen(near, chosen)))
-            parts.clear()
-        step.tokens = inputs[0][0, :, chosen]
-        step.coords = near.center[0, :, chosen]
-        step.moved = output[0, :, chosen, :3].float()
-        self.steps.append(step)
+    def _record(self, window: Window, coords: Tensor, after: tuple[Tensor, Tensor], tokens: Tensor) -> None:
+        members = window.columns.tolist()
+        columns = [column for column in self.columns if column in members]
+        chosen = [members.index(column) for column in columns]
+        before, new, logits, tokens = (x[:, :, chosen].detach() for x in (coords, *after, tokens))
+        levels = [self._level(window, i, chosen, before) for i in range(len(window.levels))]
+        xyz = to_world(window.norm.restore(new), window.scene.frames, window.scene.space)[0]
+        states = tokens[0], before[0], (new - before)[0], logits[0]
+        self.steps.append(StepRecord(window.scene.start, columns, levels, *states, xyz))
 
-    def _level(self, index: int, kept: Tensor, near: Neighbors) -> LevelRecord:
+    def _level(self, window: Window, index: int, chosen: list[int], coords: Tensor) -> LevelRecord:
+        scene, level = window.scene, window.levels[index]
+        uv = scene.space.to_pixels(window.norm.restore(coords), scene.frames.intrinsics, scene.frames.extrinsics)
+        near = _first(self.tracker.neighborhood(level, coords, level.cells(uv, scene.frames.size)))
+        support, kept = _first(window.support[index].pick(chosen)), window.kept[index][0, chosen]
         context = self.tracker.context
-        if not isinstance(context, N2N):
-            return LevelRecord(near)
-        pair = context.pairs[index % len(context.pairs)]
-        tokens = near.features + context.embed.offset(index, near.offsets)
-        support = kept[:, : kept.shape[1] - context.use_features].expand(len(tokens), -1, -1, -1)
-        ways = pair.support_from_context, pair.context_from_support
-        bags = ways[0](support, tokens), ways[1](tokens, support)
-        looks = [
-            way.attention.weights(way.norm(x), way.norm_context(y)).mean(-3)
-            for way, x, y in zip(ways, (support, tokens), (tokens, support), strict=True)
-        ]
-        pools = [
-            pool.attention.weights(pool.token.expand(*[1] * (bag.ndim - 2), 1, -1), bag).mean(-3).squeeze(-2)
-            for pool, bag in zip((pair.pool_support, pair.pool_context), bags, strict=True)
-        ]
-        return LevelRecord(near, *looks, *pools, support[0], tokens)
+        if isinstance(context, N2N):
+            found = _look_at_n2n(context, index, kept, near)
+        elif isinstance(context, P2N):
+            found = _look_at_p2n(context, index, kept, near)
+        else:
+            found = {}
+        return LevelRecord(near, support, **found)
 
 
-def _chosen(near: Neighbors, columns: list[int]) -> Neighbors:
-    indices = None if near.indices is None else near.indices[0, :, columns]
-    return Neighbors(near.features[0, :, columns], near.points[0, :, columns], near.center[0, :, columns], indices)
+def _look_at_n2n(context: N2N, index: int, kept: Tensor, near: Neighbors) -> dict[str, Tensor]:
+    pair = context.pairs[index % len(context.pairs)]
+    tokens = near.features + context.embed.offset(index, near.offsets)  # (S, n, K, D)
+    support = kept[:, : kept.shape[1] - context.use_features]
+    both = support.expand(len(tokens), -1, -1, -1)
+    ways = pair.support_from_context, pair.context_from_support
+    bags = ways[0](both, tokens), ways[1](tokens, both)
+    looks = (
+        way.attention.weights(way.norm(x), way.norm_context(y)).mean(-3)
+        for way, x, y in zip(ways, (both, tokens), (tokens, both), strict=True)
+    )
+    pools = (
+        pool.attention.weights(pool.token.expand(*bag.shape[:-2], -1, -1), bag).mean(-3).squeeze(-2)
+        for pool, bag in zip((pair.pool_support, pair.pool_context), bags, strict=True)
+    )
+    names = "support_from_context", "context_from_support", "pool_support", "pool_context"
+    weights = dict(zip(names, (*looks, *pools), strict=True))
+    return weights | {"support_tokens": support, "context_tokens": tokens}
 
 
-def _joined(parts: list[Neighbors]) -> Neighbors:
-    def join(name: str) -> Tensor | None:
-        values = [getattr(part, name) for part in parts]
-        return None if values[0] is None else torch.cat(values, 2)
+def _look_at_p2n(context: P2N, index: int, kept: Tensor, near: Neighbors) -> dict[str, Tensor]:
+    look = context.looks[index % len(context.looks)]
+    tokens = near.features + context.embed.offset(index, near.offsets)  # (S, n, K, D)
+    query = kept[:, None].expand(len(tokens), -1, -1, -1)
+    weights = look.attention.weights(look.norm(query), look.norm_context(tokens)).mean(-3).squeeze(-2)
+    return {"query_from_context": weights, "support_tokens": kept[:, None], "context_tokens": tokens}
 
-    return Neighbors(*(join(name) for name in ("features", "points", "center", "indices")))
+
+def _first(near: Neighbors) -> Neighbors:
+    """The only clip of a batch."""
+    indices = None if near.indices is None else near.indices[0]
+    return Neighbors(near.features[0], near.points[0], near.center[0], indices)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tapip3d_lite.model.cloud import Level, Normalizer
 from tapip3d_lite.model.frames import Frames
+from tapip3d_lite.model.neighbors import Neighbors
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Scene:
         valid: (B, T, H, W) bool: depth known and inside the region of interest.
         levels: the feature cloud.
         space: the trajectories' space.
+        start: which frame of the clip is the first.
     """
 
     frames: Frames
@@ -32,13 +34,13 @@ class Scene:
     valid: Tensor
     levels: list[Level]
     space: Any
+    start: int = 0
 
     def cut(self, start: int, stop: int) -> Scene:
         """Frames [start, stop)."""
         levels = [level.cut(start, stop) for level in self.levels]
-        return Scene(
-            self.frames.cut(start, stop), self.points[:, start:stop], self.valid[:, start:stop], levels, self.space
-        )
+        points, valid = self.points[:, start:stop], self.valid[:, start:stop]
+        return Scene(self.frames.cut(start, stop), points, valid, levels, self.space, self.start + start)
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,8 @@ class Window:
         levels: L levels of the cloud, prepared by the context, with normalised points.
         kept: L times (B, n, ...), what the context remembers of the queries.
         active: (B, n) bool, tracks that exist, or None if all do.
+        columns: (n,) which of all tracks these are, and
+        support: L times (B, n, 1 + K, ...) their neighbourhoods in the query frame, normalised: for those who look on.
     """
 
     scene: Scene
@@ -86,6 +90,8 @@ class Window:
     levels: list[Level]
     kept: list[Tensor]
     active: Tensor | None = None
+    columns: Tensor | None = None
+    support: list[Neighbors] | None = None
 
 
 def to_world(coords: Tensor, frames: Frames, space: Any) -> Tensor:

@@ -4,16 +4,21 @@ Paper: section 3.2 and table 4. In `world` the cameras' motion is cancelled and 
 trajectory; in `camera` every frame has its own axes, so a static point moves against the camera's motion.
 
 The image spaces of table 4 stand beside them: pixels with depth (`uvd`), with log depth (`uvlogd`), or alone (`uv`, which
-is how 2D trackers work; depth then lifts their result). A space is any object with the four methods of `Space`; cameras
-always come per frame.
+is how 2D trackers work; depth then lifts their result). A space is any object with the four methods `lift`, `from_world`,
+`to_world` and `to_pixels` of `Space`; cameras always come per frame.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from tapip3d_lite.geometry import invert, pixel_grid, point_map, project, transform, unproject
+from tapip3d_lite.model.cloud import quantile_roi
+from tapip3d_lite.model.neighbors import knn
 
 
 class Space:
@@ -21,6 +26,10 @@ class Space:
 
     name = "world"
     moves = (1.0, 1.0, 1.0)  # axes along which a trajectory may move
+
+    def fit(self, depths: Tensor) -> Space:
+        """The space for clips whose first frames have depths (B, H, W); only `uvd` depends on them."""
+        return self
 
     def lift(self, depths: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:
         """Depth maps to point maps in this space.
@@ -107,15 +116,29 @@ class UVLogD(Space):
 
 
 class UVD(UVLogD):
-    """Pixels and z. The axes have different units, so a tracker in this space needs `norm_mode="anisotropy"`."""
+    """Pixels and (z - near) / (far - near) W as SpatialTracker's, so that the three axes are comparable.
+
+    Args:
+        near: (B,) depth whose third coordinate is 0.
+        unit: (B,) pixels in one unit of depth.
+    """
 
     name = "uvd"
 
+    def __init__(self, near: Tensor | float = 0.0, unit: Tensor | float = 1.0) -> None:
+        self.near, self.unit = torch.as_tensor(near), torch.as_tensor(unit)
+
+    def fit(self, depths: Tensor) -> UVD:
+        """Near and far of each clip's first frame, outliers (sky) left out; later frames are not known to a stream."""
+        ranges = [_depth_range(depth) for depth in depths]
+        near, far = (torch.tensor(x, dtype=depths.dtype, device=depths.device) for x in zip(*ranges, strict=True))
+        return UVD(near, depths.shape[-1] / (far - near))
+
     def _encode(self, z: Tensor, intrinsics: Tensor) -> Tensor:
-        return z
+        return (z - _per_clip(self.near, z)) * _per_clip(self.unit, z)
 
     def _decode(self, third: Tensor, intrinsics: Tensor) -> Tensor:
-        return third
+        return third / _per_clip(self.unit, third) + _per_clip(self.near, third)
 
 
 class UV(UVLogD):
@@ -125,13 +148,11 @@ class UV(UVLogD):
     moves = (1.0, 1.0, 0.0)
 
     def to_world(self, coords: Tensor, intrinsics: Tensor, extrinsics: Tensor, depths: Tensor) -> Tensor:
-        """See `Space.to_world`: the depth of the nearest pixel, or the frame's median where that is unknown."""
-        height, width = depths.shape[-2:]
-        u, v = coords[..., 0].round().clamp(0, width - 1), coords[..., 1].round().clamp(0, height - 1)
-        flat = depths.flatten(-2)
-        z = flat.gather(-1, (v * width + u).long())
-        median = torch.where(flat > 0, flat, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num(1.0)
-        return unproject(coords[..., :2], torch.where(z > 0, z, median), intrinsics, extrinsics)
+        """See `Space.to_world`: the depth of the nearest pixel that has one (interpolation would mix surfaces)."""
+        uv = coords[..., :2]
+        maps = zip(depths.reshape(-1, *depths.shape[-2:]), uv.reshape(-1, *uv.shape[-2:]), strict=True)
+        z = torch.stack([_nearest_depth(*frame) for frame in maps])
+        return unproject(uv, z.reshape(uv.shape[:-1]), intrinsics, extrinsics)
 
     def _encode(self, z: Tensor, intrinsics: Tensor) -> Tensor:
         return torch.zeros_like(z)
@@ -140,3 +161,32 @@ class UV(UVLogD):
 def _focal(intrinsics: Tensor) -> Tensor:
     """(..., 1): sqrt(fx fy)."""
     return (intrinsics[..., 0, 0] * intrinsics[..., 1, 1]).sqrt().unsqueeze(-1)
+
+
+def fitted(space: Any, depths: Tensor) -> Any:
+    """A space for clips whose first frames have depths (B, H, W); custom spaces need no `fit`."""
+    return space.fit(depths) if hasattr(space, "fit") else space
+
+
+def _per_clip(value: Tensor, like: Tensor) -> Tensor:
+    return value.to(like).reshape(*value.shape, *[1] * (like.ndim - value.ndim))
+
+
+def _depth_range(depth: Tensor) -> tuple[float, float]:
+    valid = depth[depth > 0]
+    if not len(valid):
+        return 0.0, 1.0
+    near, far = float(valid.min()), float(valid[valid <= quantile_roi(valid)[1]].max())
+    return near, max(far, near * 1.01)
+
+
+def _nearest_depth(depth: Tensor, uv: Tensor) -> Tensor:
+    """Depth (N,) of a map (H, W) at the pixels nearest to uv (N, 2); holes take the nearest valid pixel's, if any."""
+    last = torch.tensor([depth.shape[1] - 1, depth.shape[0] - 1], dtype=uv.dtype, device=uv.device)
+    column, row = uv.detach().nan_to_num().round().clamp(min=torch.zeros_like(last), max=last).long().unbind(-1)
+    z, hole, valid = depth[row, column], depth[row, column] <= 0, (depth > 0).nonzero()
+    if len(valid) and bool(hole.any()):
+        here, there = (F.pad(x.float(), (0, 1)) for x in (torch.stack([row, column], -1)[hole], valid))
+        near = valid[knn(here[None], there[None], 1)[0, :, 0]]
+        z = z.masked_scatter(hole, depth[near[:, 0], near[:, 1]])
+    return z

@@ -6,6 +6,7 @@ result equals the offline tracker's forward pass on the same frames.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,15 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip, Tracks
-from tapip3d_lite.model.frames import Frames, frames_from_clip
+from tapip3d_lite.model import inference
+from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.parts import make_space
 from tapip3d_lite.model.scene import to_world
+from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.windows import State
+from tapip3d_lite.queries import grid_queries
+from tapip3d_lite.validate import floats
 
 
 class Stream:
@@ -28,8 +33,12 @@ class Stream:
         queries: (N, 4) rows (t, x, y, z), world; t counts pushed frames and may lie in the future.
         space: as for `track`.
         iterations: M, the config's if None.
+        support_grid: side of a grid of extra queries on the first frame that are tracked along and never told.
         depth_roi: depths (near, far) that count for the scale; None: all. It cannot be found from the whole clip here.
         visible_threshold: probability from which a point counts as visible.
+
+    Raises:
+        ValueError: queries that are no (N, 4) rows with whole frame numbers, or a bad option.
     """
 
     def __init__(
@@ -38,21 +47,25 @@ class Stream:
         queries: np.ndarray,
         space: Any = None,
         iterations: int | None = None,
+        support_grid: int = 0,
         depth_roi: tuple[float, float] | None = None,
         visible_threshold: float = 0.9,
     ) -> None:
-        device = next(tracker.parameters()).device
+        inference.check_options(tracker, space, depth_roi, visible_threshold, support_grid)
+        if isinstance(depth_roi, str):
+            raise ValueError(
+                f"depth_roi: a stream does not know the whole clip's depths, so {depth_roi!r} cannot work; give (near, far) or None"
+            )
+        if iterations is not None and iterations < 1:
+            raise ValueError(f"iterations: expected at least 1, got {iterations}")
         self.tracker, self.space, self.roi = tracker, make_space(space or tracker.space), depth_roi
-        self.iterations, self.threshold = iterations or tracker.config.iterations, visible_threshold
-        self.queries = np.asarray(queries, np.float32).reshape(-1, 4)
-        self.rows = torch.from_numpy(self.queries).to(device)[None]
-        count = len(self.queries)
-        nothing = torch.zeros(1, 0, count, 3, device=device)
-        self.state = State(nothing, nothing[..., 0], nothing.new_zeros(1, count, 3), self.rows[..., 0].long())
+        self.iterations = tracker.config.iterations if iterations is None else iterations
+        self.threshold, self.grid = visible_threshold, support_grid
+        self.queries = _checked(queries)
+        self._begin(self.queries)
         self.window: list[tuple[Frames, Tensor]] = []  # the last S frames with their features
         self.cameras: list[tuple[Tensor, Tensor, Tensor]] = []  # intrinsics, extrinsics, depth of every frame
         self.support: list[Neighbors] = []
-        self.xyz = np.zeros((0, count, 3), np.float32)
         self.seen = 0
 
     def push(
@@ -74,7 +87,12 @@ class Stream:
             ValueError: arrays that do not fit, as for `Clip`.
         """
         clip = Clip(image[None], depth[None], np.asarray(intrinsics)[None], np.asarray(extrinsics)[None])
-        frames = frames_from_clip(clip, self.tracker.config.image_size, self.rows.device)
+        clip = resize_clip(clip, self.tracker.config.image_size)
+        frames = frames_from_clip(clip, device=self.rows.device)
+        if self.seen == 0:
+            self.space = fitted(self.space, frames.depths[:, 0])
+            grid = grid_queries(clip, self.grid) if self.grid else self.queries[:0]
+            self._begin(np.concatenate([self.queries, grid]))
         with torch.no_grad():
             return self._push(frames, self.tracker.encoder(frames.rgb))
 
@@ -85,6 +103,13 @@ class Stream:
         while self.seen and self.seen % (self.tracker.config.window // 2):
             self._push(*self.window[-1])
         return self._tracks(0, real)
+
+    def _begin(self, rows: np.ndarray) -> None:
+        """Trajectories of no frames yet, of queries (N, 4) and the support grid's."""
+        self.rows = torch.from_numpy(rows).to(next(self.tracker.parameters()).device)[None]
+        nothing = self.rows.new_zeros(1, 0, len(rows), 3)
+        self.state = State(nothing, nothing[..., 0], nothing.new_zeros(1, len(rows), 3), self.rows[..., 0].long())
+        self.xyz = np.zeros((0, len(rows), 3), np.float32)
 
     def _push(self, frames: Frames, features: Tensor) -> Tracks | None:
         state, size, now = self.state, self.tracker.config.window, self.seen
@@ -97,8 +122,11 @@ class Stream:
             state.queries[:, arriving] = self.space.from_world(mine, frames.intrinsics, frames.extrinsics)[:, 0]
             state.coords[:, :, arriving] = state.queries[:, None, arriving]
         state.coords = torch.cat([state.coords, state.queries[:, None]], 1)
-        state.logits = torch.cat([state.logits, state.coords.new_zeros(1, 1, len(self.queries))], 1)
-        self.xyz = np.concatenate([self.xyz, self._still(slice(now, now + 1), slice(None))])
+        state.logits = torch.cat([state.logits, state.coords.new_zeros(1, 1, self.rows.shape[1])], 1)
+        future = (state.times[0] > now).cpu().numpy()
+        still = self._still(slice(now, now + 1), slice(None))
+        still[:, future] = self.rows[0, future, 1:].cpu().numpy()  # known to the world, but not yet to a camera
+        self.xyz = np.concatenate([self.xyz, still])
         if bool(arriving.any()):
             self.xyz[:, arriving.cpu().numpy()] = self._still(slice(0, now + 1), arriving)
         self.window = [*self.window[-(size - 1) :], (frames, features)]
@@ -121,10 +149,10 @@ class Stream:
                 *(torch.cat([getattr(f, name) for f, _ in self.window], 1) for name in Frames.__annotations__)
             )
             features = torch.cat([x for _, x in self.window], 1)
-            scene = self.tracker.scene(frames, features, self.space, self.roi)
+            scene = replace(self.tracker.scene(frames, features, self.space, self.roi), start=start)
             self._add_support(scene, start, stop)
             coords, logits = self.state.initial(start, stop, columns)
-            window = self.tracker.window(scene, [near.pick(columns) for near in self.support], mask)
+            window = self.tracker.window(scene, [near.pick(columns) for near in self.support], mask, columns)
             coords = window.norm.normalize(coords)
             for _ in range(self.iterations):
                 coords, logits = self.tracker.update(window, coords, logits)
@@ -151,9 +179,20 @@ class Stream:
                     getattr(whole, name)[:, new] = getattr(near, name)
 
     def _tracks(self, start: int, stop: int) -> Tracks:
-        logits = self.state.logits[0, start:stop].cpu().numpy()
+        count = len(self.queries)  # without the support grid
+        logits = self.state.logits[0, start:stop, :count].cpu().numpy()
         visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= self.threshold
-        return Tracks(self.xyz[start:stop].copy(), visible, self.queries, logits)
+        return Tracks(self.xyz[start:stop, :count].copy(), visible, self.queries, logits)
+
+
+def _checked(queries: Any) -> np.ndarray:
+    rows = floats("queries", queries, (None, 4), finite=True)
+    wrong = (rows[:, 0] < 0) | (rows[:, 0] != np.rint(rows[:, 0]))
+    if wrong.any():
+        raise ValueError(
+            f"queries: t must be a whole frame number from 0 on, got {rows[wrong][0, 0]:g} in (t, x, y, z)"
+        )
+    return rows
 
 
 def _empty(near: Neighbors, count: int) -> Neighbors:

@@ -22,6 +22,7 @@ from tapip3d_lite.model.frames import Frames
 from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.parts import make_module, make_space
 from tapip3d_lite.model.scene import Scene, Step, Window, to_world
+from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.stream import Stream
 from tapip3d_lite.model.support import query_support
 from tapip3d_lite.model.tokens import token_width, trajectory_tokens
@@ -58,9 +59,9 @@ class Tracker(nn.Module):
             xyz (B, T, N, 3), world, and visibility logits (B, T, N). Before a query's first window, and in clips of
             at most S / 2 frames, the query's position and 0.
         """
-        space = make_space(options.get("space") or self.space)
+        space = fitted(make_space(options.get("space") or self.space), frames.depths[:, 0])
         state = State.start(queries, frames, space, self.config.window // 2)
-        for _ in self.steps(frames, queries, state=state, **options):
+        for _ in self.steps(frames, queries, state=state, **(options | {"space": space})):
             pass
         count = len(frames)
         return to_world(state.coords[:, :count], frames, space), state.logits[:, :count]
@@ -93,7 +94,7 @@ class Tracker(nn.Module):
         self._check(frames, iterations)
         if queries.shape[1] == 0:
             return
-        space, half = make_space(space or self.space), config.window // 2
+        space, half = fitted(make_space(space or self.space), frames.depths[:, 0]), config.window // 2
         features = self.encoder(frames.rgb) if features is None else features
         state = State.start(queries, frames, space, half) if state is None else state
         scene = self.scene(frames, features, space, depth_roi)
@@ -105,7 +106,7 @@ class Tracker(nn.Module):
                 continue
             coords, logits = state.initial(start, stop, columns)
             cut = scene.cut(start, stop)
-            window = self.window(cut, [near.pick(columns) for near in support], mask)
+            window = self.window(cut, [near.pick(columns) for near in support], mask, columns)
             coords = window.norm.normalize(coords)
             for iteration in range(iterations):
                 # Nothing flows back from one iteration into the one before.
@@ -142,19 +143,21 @@ class Tracker(nn.Module):
         with torch.autocast(coords.device.type, enabled=False):
             return query_support(self.neighborhood, scene, queries[..., 0].long(), coords)
 
-    def window(self, scene: Scene, support: list[Neighbors], active: Tensor) -> Window:
+    def window(self, scene: Scene, support: list[Neighbors], active: Tensor, columns: Tensor | None = None) -> Window:
         """Normalise one window and let the context prepare it.
 
         Args:
             scene: S frames.
             support: L times (B, n, 1 + K, ...), from `support`.
             active: (B, n) bool, tracks that exist.
+            columns: (n,) which of all tracks these are; only looked at from outside.
         """
         norm = Normalizer.fit(scene.points, scene.valid, self.config.norm_mode, self.config.norm_scale)
         cloud = [replace(level, points=norm.normalize(level.points)) for level in scene.levels]
         levels = [self.context.prepare(i, level) for i, level in enumerate(cloud)]
-        kept = [self.context.describe(i, near.normalized(norm)) for i, near in enumerate(support)]
-        return Window(scene, norm, levels, kept, None if bool(active.all()) else active)
+        support = [near.normalized(norm) for near in support]
+        kept = [self.context.describe(i, near) for i, near in enumerate(support)]
+        return Window(scene, norm, levels, kept, None if bool(active.all()) else active, columns, support)
 
     def update(self, window: Window, coords: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
         """Update the trajectories of one window once (equation 1).
