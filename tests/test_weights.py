@@ -214,6 +214,62 @@ def test_a_custom_part_cannot_be_saved(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def with_pickle(path, pickled):
+    """A checkpoint file whose pickle is the given bytes."""
+    torch.save({"a": torch.zeros(2)}, path)
+    with zipfile.ZipFile(path) as source:
+        entries = {name: source.read(name) for name in source.namelist()}
+    with zipfile.ZipFile(path, "w") as target:
+        for name, content in entries.items():
+            target.writestr(name, pickled if name.endswith("data.pkl") else content)
+
+
+def test_a_pickle_cannot_change_torch_itself(tmp_path):
+    """BUILD sets attributes of any object that a pickle finds, here a function's default arguments."""
+    before = torch._utils._rebuild_tensor_v2.__defaults__
+    build = b"N}X\x0c\x00\x00\x00__defaults__K\x01K\x02K\x03\x87s\x86b."
+    with_pickle(tmp_path / "x.pth", b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n" + build)
+    with pytest.raises(ValueError, match=r"x\.pth"):
+        t3d.load_official(tmp_path / "x.pth")
+    assert torch._utils._rebuild_tensor_v2.__defaults__ == before
+
+
+@pytest.mark.parametrize(
+    "pickled",
+    [
+        b"\x80\x02c__builtin__\nbytes\n\x8a\x06\xff\xff\xff\xff\xff\x7f\x85R.",  # 140 TB
+        b"\x80\x02K\x05Q.",  # a storage that is no tuple: an assertion inside torch
+        b"\x80\x02.",
+    ],
+    ids=["memory", "storage", "empty"],
+)
+def test_damaged_pickles_are_value_errors(tmp_path, pickled):
+    with_pickle(tmp_path / "x.pth", pickled)
+    with pytest.raises(ValueError, match="not a readable checkpoint"):
+        t3d.load_official(tmp_path / "x.pth")
+
+
+@needs_checkpoint
+def test_flipped_bytes_never_raise_anything_else(tmp_path):
+    rng = np.random.default_rng(0)
+    with zipfile.ZipFile(CHECKPOINT) as source:
+        pickled = next(source.read(name) for name in source.namelist() if name.endswith("data.pkl"))
+    for _ in range(40):
+        damaged = bytearray(pickled)
+        for place in rng.integers(0, len(damaged), 3):
+            damaged[place] = rng.integers(256)
+        with_pickle(tmp_path / "x.pth", bytes(damaged))
+        with pytest.raises(ValueError, match=r"x\.pth|cfg|state|TrackerConfig"):
+            t3d.load_official(tmp_path / "x.pth")  # the storages are not there, so it can never succeed
+
+
+@pytest.mark.parametrize("weight", [5, [torch.zeros(1)], {"a": 1}])
+def test_weights_that_are_no_tensors(tmp_path, weight):
+    torch.save({"cfg": {"model": {}}, "weight": weight}, tmp_path / "x.pth")
+    with pytest.raises(ValueError, match="named tensors"):
+        t3d.load_official(tmp_path / "x.pth")
+
+
 def test_allowed_numpy_scalars(tmp_path):
     buffer = io.BytesIO()
     torch.save({"a": np.float32(2), "b": np.arange(3)}, buffer)

@@ -13,8 +13,9 @@ import re
 import tarfile
 import zipfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, SimpleNamespace
 from typing import Any, BinaryIO
 
 import safetensors.torch
@@ -133,7 +134,12 @@ def load_official(path: str | Path) -> Tracker:
         cfg = _resolved(cfg, cfg)
     except RecursionError:
         raise ValueError(f"{path}: the configuration refers to itself; the file is damaged") from None
-    return from_official_state(cfg, content["weight"])
+    weight = content["weight"]
+    if not isinstance(weight, Mapping) or not all(isinstance(value, torch.Tensor) for value in weight.values()):
+        raise ValueError(
+            f'{path}: expected "weight" to hold named tensors, got {type(weight).__name__} of other things'
+        )
+    return from_official_state(cfg, weight)
 
 
 def plain(value: Any) -> Any:
@@ -173,7 +179,9 @@ class _Unpickler(pickle.Unpickler):
         module = _OLD_NAMES.get(module, module)
         name = "int" if (module, name) == ("builtins", "long") else name
         if name in _HARMLESS.get(module, ()):
-            return super().find_class(module, name)
+            found = super().find_class(module, name)
+            # A pickle may set attributes of what it finds; a function's defaults would stay changed in this process.
+            return partial(found) if isinstance(found, FunctionType) else found
         if module.split(".")[0] in _RECORDED:
             return type(name, (_Record,), {})
         raise pickle.UnpicklingError(f"{module}.{name} is refused")
@@ -205,9 +213,9 @@ def _read_pickle(path: str | Path) -> Any:
             if "is refused" in str(error)
             else f"{path}: not a readable checkpoint ({error})"
         ) from None
-    except (RuntimeError, EOFError, KeyError, IndexError, AttributeError, TypeError, OSError, ValueError) as error:
+    except Exception as error:  # a damaged pickle fails in any way, an assertion or too little memory among them
         raise ValueError(
-            f"{path}: not a readable checkpoint ({error}); it may be truncated or of another format"
+            f"{path}: not a readable checkpoint ({type(error).__name__}: {error}); it may be truncated or of another format"
         ) from error
 
 
