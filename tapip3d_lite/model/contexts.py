@@ -120,7 +120,9 @@ class N2N(Context):
         return torch.cat([tokens, features[..., :1, :]], -2) if self.use_features else tokens
 
     def forward(self, index: int, kept: Tensor, near: Neighbors) -> Tensor:
-        """See `Context.forward`."""
+        """See `Context.forward`; `kept` may also be what `fast.get_ready` made of it, for the same result sooner."""
+        if not isinstance(kept, Tensor):
+            return kept.compare(self, index, near)
         context = near.features + self.embed.offset(index, near.offsets)  # (B, S, N, K, D)
         lead = context.shape[:3]
         kept = kept[:, None].expand(*lead, *kept.shape[2:])

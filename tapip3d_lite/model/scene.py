@@ -5,7 +5,7 @@ Paper: section 3.2 (the scene as a spatio-temporal feature cloud).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -83,6 +83,7 @@ class Window:
         active: (B, n) bool, tracks that exist, or None if all do.
         columns: (n,) which of all tracks these are, and
         support: L times (B, n, 1 + K, ...) their neighbourhoods in the query frame, normalised: for those who look on.
+        ready: what the tracker's fast form made of `kept`, once a window.
     """
 
     scene: Scene
@@ -92,6 +93,7 @@ class Window:
     active: Tensor | None = None
     columns: Tensor | None = None
     support: list[Neighbors] | None = None
+    ready: dict[Any, list] = field(default_factory=dict, repr=False)
 
 
 def to_world(coords: Tensor, frames: Frames, space: Any) -> Tensor:

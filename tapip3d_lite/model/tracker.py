@@ -16,7 +16,9 @@ from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.model import inference
 from tapip3d_lite.model.cloud import Normalizer, feature_cloud
 from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.contexts import N2N
 from tapip3d_lite.model.encoder import Encoder
+from tapip3d_lite.model.fast import get_ready
 from tapip3d_lite.model.fourier import time_embedding
 from tapip3d_lite.model.frames import Frames
 from tapip3d_lite.model.neighbors import Neighbors
@@ -34,7 +36,13 @@ __all__ = ["Tracker", "TrackerConfig"]
 
 
 class Tracker(nn.Module):
-    """Tracks any points of a posed RGB-D video in 3D."""
+    """Tracks any points of a posed RGB-D video in 3D.
+
+    Attributes:
+        fast: compute N2N by `fast.Ready`, which gives the same numbers as the clear form in `contexts` sooner.
+    """
+
+    fast: bool = True
 
     def __init__(self, config: TrackerConfig) -> None:
         super().__init__()
@@ -194,14 +202,23 @@ class Tracker(nn.Module):
         count, config = coords.shape[2], self.config
         floats = coords.shape[0] * coords.shape[1] * config.neighbors * config.token_dim * 4
         step = count if torch.is_grad_enabled() else max(1, _CHUNK // floats)
-        chunks = []
+        ready, chunks = self._ready(window), []
         for rows in (slice(i, i + step) for i in range(0, count, step)):
             outputs = []
-            for i, (level, kept) in enumerate(zip(window.levels, window.kept, strict=True)):
+            for i, (level, kept) in enumerate(zip(window.levels, ready, strict=True)):
                 near = self.neighborhood(level, coords[:, :, rows], level.cells(uv[:, :, rows], config.image_size))
                 outputs.append(self.context(i, kept[:, rows], near))
             chunks.append(torch.cat(outputs, -1))
         return torch.cat(chunks, 2)
+
+    def _ready(self, window: Window) -> list:
+        """What the context remembers of the queries, in its fast form where it has one."""
+        if not (self.fast and isinstance(self.context, N2N)):
+            return window.kept
+        mode = torch.is_grad_enabled()
+        if mode not in window.ready:
+            window.ready[mode] = get_ready(self.context, window.kept)
+        return window.ready[mode]
 
     def track(self, clip: Clip, queries: Any = None, **options: Any) -> Tracks:
         """Track points of one clip; see `inference.track` for the options."""

@@ -1,0 +1,110 @@
+"""The fast form of N2N equals the clear one, in values and gradients."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.contexts import N2N
+from tapip3d_lite.model.fast import get_ready
+from tapip3d_lite.model.neighbors import Neighbors
+
+CONFIGS = {
+    "one head": {},
+    "one head of another width": {"context_head_dim": 12, "context_mlp_ratio": 2.0},
+    "several heads": {"context_heads": 4, "context_head_dim": 6},
+    "shared weights": {"share_levels": True},
+    "width of the features": {"token_dim": 24},
+    "query feature appended": {"use_features": True},
+    "one neighbour": {"neighbors": 1},
+}
+
+
+def n2n(seed, dtype, **changes):
+    """A context with all parameters random, so that no bias or gain can hide."""
+    torch.manual_seed(seed)
+    sizes = {"feature_dim": 24, "token_dim": 16, "context_head_dim": 16, "neighbors": 5, "levels": 2}
+    context = N2N(TrackerConfig(**(sizes | changes))).to(dtype)
+    for parameter in context.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    return context
+
+
+def bags(seed, context, count, dtype, batch=2, frames=3, tracks=4):
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.randn(*shape, generator=generator, dtype=dtype)
+
+    channels = context.embed.norm.normalized_shape[0]
+    support = Neighbors(
+        rand(batch, tracks, count + 1, channels), rand(batch, tracks, count + 1, 3), rand(batch, tracks, 3)
+    )
+    near = Neighbors(
+        rand(batch, frames, tracks, count, channels),
+        rand(batch, frames, tracks, count, 3),
+        rand(batch, frames, tracks, 3),
+    )
+    return support, near
+
+
+def both(context, support, near):
+    """Clear and fast result of each level."""
+    levels = range(2)
+    kept = [context.describe(i, support) for i in levels]
+    cells = replace(near, features=context.embed.features(near.features))
+    ready = get_ready(context, kept)
+    return [(context(i, kept[i], cells), context(i, ready[i], cells)) for i in levels]
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+@pytest.mark.parametrize("changes", CONFIGS.values(), ids=CONFIGS)
+def test_the_fast_form_equals_the_clear_one(changes, gradient):
+    context = n2n(1, torch.float64, **changes)
+    support, near = bags(2, context, changes.get("neighbors", 5), torch.float64)
+    with torch.set_grad_enabled(gradient):
+        results = both(context, support, near)
+    for clear, fast in results:
+        assert clear.abs().max() > 0.1
+        assert fast.shape == clear.shape
+        torch.testing.assert_close(fast, clear, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("changes", CONFIGS.values(), ids=CONFIGS)
+def test_gradients_are_equal(changes):
+    context = n2n(3, torch.float64, **changes)
+    support, near = bags(4, context, changes.get("neighbors", 5), torch.float64)
+    inputs = [support.features, near.features, near.center, *context.parameters()]
+    for x in inputs:
+        x.requires_grad_()
+    totals = [0, 0]
+    for pair in both(context, support, near):
+        totals = [total + result.sin().sum() for total, result in zip(totals, pair, strict=True)]
+    gradients = [torch.autograd.grad(total, inputs, retain_graph=True, allow_unused=True) for total in totals]
+    for clear, fast in zip(*gradients, strict=True):
+        if clear is not None:  # biases of keys have no effect
+            fast = torch.zeros_like(clear) if fast is None else fast
+            torch.testing.assert_close(fast, clear, rtol=1e-8, atol=1e-8)
+
+
+def test_nearly_constant_tokens_are_normalised_with_the_right_eps():
+    """The two directions normalise with eps 1e-5 and 1e-6; where tokens hardly vary, that matters."""
+    context = n2n(5, torch.float64, offset_layers=1)
+    for parameter in (*context.embed.project.parameters(), *context.embed.offsets.parameters()):
+        torch.nn.init.normal_(parameter, std=1e-3)
+    support, near = bags(6, context, 5, torch.float64)
+    with torch.no_grad():
+        for clear, fast in both(context, support, near):
+            torch.testing.assert_close(fast, clear, rtol=1e-8, atol=1e-8)
+
+
+def test_float32_and_a_cut_of_the_tracks():
+    context = n2n(7, torch.float32)
+    support, near = bags(8, context, 5, torch.float32)
+    with torch.no_grad():
+        kept = [context.describe(i, support) for i in range(2)]
+        cells = replace(near, features=context.embed.features(near.features))
+        ready = get_ready(context, kept)[1][:, 1:3]
+        part = replace(cells, **{name: getattr(cells, name)[:, :, 1:3] for name in ("features", "points", "center")})
+        torch.testing.assert_close(context(1, ready, part), context(1, kept[1], cells)[:, :, 1:3], rtol=1e-4, atol=1e-4)
