@@ -36,7 +36,7 @@ def trajectory_tokens(
     step = coords[:, :-1] - coords[:, 1:]  # self minus next
     still = torch.zeros_like(coords[:, :1])
     motion = torch.cat([torch.cat([step, still], 1), torch.cat([still, -step], 1)], -1)
-    parts = [logits.unsqueeze(-1), evidence.float(), fourier(motion)]
+    parts = [logits.unsqueeze(-1), evidence.to(coords.dtype), fourier(motion)]
     if uv is not None:
         sides = torch.tensor([size[1], size[0]], dtype=uv.dtype, device=uv.device)
         # Points far outside the image would otherwise drive the Fourier features with arbitrary phases.

@@ -118,9 +118,10 @@ class Tracker(nn.Module):
             coords = window.norm.normalize(coords)
             for iteration in range(iterations):
                 # Nothing flows back from one iteration into the one before.
-                coords, logits = self.update(window, coords.detach(), logits.detach())
+                coords, logits = self.update(window, coords, logits)
                 yield Step(start, iteration, window.norm.restore(coords), logits, columns, mask, cut)
-            state.write(start, stop, columns, mask, window.norm.restore(coords.detach()), logits.detach())
+                coords, logits = coords.detach(), logits.detach()
+            state.write(start, stop, columns, mask, window.norm.restore(coords), logits)
 
     def scene(self, frames: Frames, features: Tensor, space: Any, depth_roi: tuple[float, float] | None) -> Scene:
         """Lift frames to a feature cloud; frames and features are padded to whole half windows."""
@@ -134,7 +135,7 @@ class Tracker(nn.Module):
             known = inside = frames.depths > 0
             if depth_roi is not None:
                 inside = known & (frames.depths >= depth_roi[0]) & (frames.depths <= depth_roi[1])
-            levels = feature_cloud(features.float(), points, known, self.config.levels)
+            levels = feature_cloud(features.to(points.dtype), points, known, self.config.levels)
             return Scene(frames, points, inside, levels, space)
 
     def support(self, scene: Scene, queries: Tensor, coords: Tensor) -> list[Neighbors]:
@@ -184,7 +185,7 @@ class Tracker(nn.Module):
         evidence = self.evidence(window, coords, uv)
         pixels = uv if self.config.use_uv else None
         tokens = trajectory_tokens(coords, logits, evidence, pixels, frames.size, self.time)
-        delta = self.updater(tokens, window.active).float()
+        delta = self.updater(tokens, window.active).to(coords.dtype)
         moves = delta.new_tensor(getattr(window.scene.space, "moves", (1.0, 1.0, 1.0)))
         return coords + delta[..., :3] * moves, logits + delta[..., 3]
 

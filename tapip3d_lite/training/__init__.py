@@ -1,0 +1,1 @@
+"""Training: the loss, its memory-saving backward, and augmentations."""

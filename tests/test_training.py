@@ -1,0 +1,138 @@
+"""The loss against a loop, and the memory-saving backward against the plain one."""
+
+import numpy as np
+import pytest
+import torch
+
+import tapip3d_lite as t3d
+from tapip3d_lite.model.frames import frames_from_clip
+from tapip3d_lite.training.backward import plain_backward, saving_backward
+from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
+
+
+def setting(frames=10, dtype=torch.float32, **changes):
+    torch.manual_seed(0)
+    clip = t3d.simulate_clip(seed=6, frames=frames, size=(32, 32), tracks=12)
+    sizes = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
+    sizes |= {"context_head_dim": 16, "hidden": 32, "iterations": 2} | changes
+    tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **sizes)).to(dtype)
+    video = frames_from_clip(clip)._map(lambda x: x.to(dtype))
+    truth = Truth(
+        torch.from_numpy(clip.tracks.xyz)[None].to(dtype),
+        torch.from_numpy(clip.tracks.visible)[None],
+        torch.from_numpy(clip.queries[:, 0]).long()[None],
+    )
+    return clip, tracker, video, torch.from_numpy(clip.queries)[None].to(dtype), truth
+
+
+@pytest.mark.parametrize("form", ["paper", "pixels"])
+def test_step_loss_is_the_loop(form):
+    clip, tracker, frames, queries, truth = setting(frames=9)  # one padded frame
+    config = LossConfig(form=form)
+    for step in tracker.steps(frames, queries):
+        position, visibility = step_loss(step, truth, 2, config)
+        a, b, count = 0.0, 0.0, 0
+        for i in range(4):
+            t = step.start + i
+            for k, n in enumerate(step.columns.tolist()):
+                if t >= 9 or t < clip.queries[n, 0]:
+                    continue
+                p = clip.tracks.xyz[t, n]
+                z = t3d.geometry.transform(p[None], clip.extrinsics[t])[0, 2]
+                error = np.linalg.norm(step.xyz[0, i, k].detach().numpy() - p) / max(z, 0.1)
+                if form == "pixels":
+                    error *= np.sqrt(clip.intrinsics[t, 0, 0] * clip.intrinsics[t, 1, 1])
+                probability = 1 / (1 + np.exp(-float(step.logits[0, i, k].detach())))
+                v = clip.tracks.visible[t, n]
+                a, count = a + error, count + 1
+                b -= np.log(probability if v else 1 - probability)
+        weight = 0.005 * 0.8 ** (1 - step.iteration) / count
+        assert float(position.detach()) == pytest.approx(weight * a, rel=1e-4)
+        assert float(visibility.detach()) == pytest.approx(weight * 3 * b, rel=1e-4)
+
+
+def gradients(run, *arguments, **options):
+    tracker = arguments[0]
+    tracker.zero_grad()
+    totals = run(*arguments, LossConfig(), **options)
+    return totals, {name: p.grad.clone() for name, p in tracker.named_parameters() if p.grad is not None}
+
+
+def test_saving_backward_has_the_plain_gradients():
+    _, tracker, frames, queries, truth = setting(dtype=torch.float64)
+    totals, plain = gradients(plain_backward, tracker, frames, queries, truth)
+    saved_totals, saved = gradients(saving_backward, tracker, frames, queries, truth)
+    assert saved_totals == pytest.approx(totals, rel=1e-12)
+    assert plain.keys() == saved.keys() and any(name.startswith("encoder") for name in saved)
+    for name, gradient in plain.items():
+        torch.testing.assert_close(saved[name], gradient, rtol=1e-8, atol=1e-10, msg=name)
+
+
+def test_tracks_that_fill_up_a_batch_do_not_count():
+    _, tracker, frames, queries, truth = setting(dtype=torch.float64)
+    few = Truth(truth.xyz[:, :, :8], truth.visible[:, :, :8], truth.times[:, :8])
+    expected, one = gradients(saving_backward, tracker, frames, queries[:, :8], few)
+    active = torch.arange(12)[None] < 8
+    totals, other = gradients(saving_backward, tracker, frames, queries, truth, active=active)
+    assert totals == pytest.approx(expected, rel=1e-9)
+    for name in one:
+        torch.testing.assert_close(one[name], other[name], rtol=1e-7, atol=1e-10, msg=name)
+
+
+class Peak:
+    """Counts the bytes that autograd keeps for backward, and their maximum."""
+
+    def __enter__(self):
+        self.now = self.most = 0
+        peak = self
+
+        class Held:
+            def __init__(self, tensor):
+                self.tensor, self.bytes = tensor.detach(), tensor.numel() * tensor.element_size()
+                peak.now += self.bytes
+                peak.most = max(peak.most, peak.now)
+
+            def __del__(self):
+                peak.now -= self.bytes
+
+        self.hooks = torch.autograd.graph.saved_tensors_hooks(Held, lambda held: held.tensor)
+        self.hooks.__enter__()
+        return self
+
+    def __exit__(self, *error):
+        self.hooks.__exit__(*error)
+
+
+def peak(run, frames, iterations):
+    _, tracker, video, queries, truth = setting(frames=frames)
+    tracker.encoder.requires_grad_(False)  # the encoder's own graph grows with the frames either way
+    with Peak() as memory:
+        run(tracker, video, queries, truth, LossConfig(), iterations=iterations)
+    return memory.most
+
+
+def test_memory_grows_neither_with_updates_nor_with_windows():
+    few, many = peak(saving_backward, 8, 2), peak(saving_backward, 8, 6)
+    assert many < 1.1 * few
+    short, long = peak(saving_backward, 8, 2), peak(saving_backward, 20, 2)
+    assert long < 1.3 * short
+    assert peak(plain_backward, 8, 6) > 2 * peak(plain_backward, 8, 2)  # so the measure can tell
+    assert peak(plain_backward, 20, 2) > 2 * short
+
+
+def test_training_on_one_clip_reduces_the_loss():
+    _, tracker, frames, queries, truth = setting()
+    optimizer = torch.optim.AdamW(tracker.parameters(), 2e-3)
+    losses = []
+    for _ in range(25):
+        optimizer.zero_grad()
+        losses.append(saving_backward(tracker, frames, queries, truth, LossConfig())["position"])
+        torch.nn.utils.clip_grad_norm_(tracker.parameters(), 10)
+        optimizer.step()
+    assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:3])
+
+
+@pytest.mark.parametrize("bad", [{"form": "metres"}, {"visibility": -1.0}, {"discount": 0.0}])
+def test_bad_weights(bad):
+    with pytest.raises(ValueError, match="LossConfig"):
+        LossConfig(**bad)
