@@ -1,14 +1,19 @@
 """The fast form of N2N equals the clear one, in values and gradients."""
 
+import gc
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.model import inference
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.contexts import N2N
 from tapip3d_lite.model.fast import get_ready
 from tapip3d_lite.model.neighbors import Neighbors
+from tapip3d_lite.model.tracker import Tracker
 
 CONFIGS = {
     "one head": {},
@@ -108,3 +113,62 @@ def test_float32_and_a_cut_of_the_tracks():
         ready = get_ready(context, kept)[1][:, 1:3]
         part = replace(cells, **{name: getattr(cells, name)[:, :, 1:3] for name in ("features", "points", "center")})
         torch.testing.assert_close(context(1, ready, part), context(1, kept[1], cells)[:, :, 1:3], rtol=1e-4, atol=1e-4)
+
+
+SMALL = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 64, "iterations": 1}
+
+
+def small_tracker():
+    torch.manual_seed(9)
+    return Tracker(TrackerConfig.preset("lite", **SMALL)).eval()
+
+
+def small_clip(frames):
+    rng = np.random.default_rng(10)
+    intrinsics = np.tile(np.float32([[30, 0, 15.5], [0, 30, 15.5], [0, 0, 1]]), (frames, 1, 1))
+    extrinsics = np.tile(np.eye(4, dtype=np.float32), (frames, 1, 1))
+    extrinsics[:, 0, 3] = 0.01 * np.arange(frames)
+    video = rng.integers(0, 256, (frames, 32, 32, 3), dtype=np.uint8)
+    depths = rng.uniform(1, 2, (frames, 32, 32)).astype(np.float32)
+    queries = np.float32([[0, 0, 0, 1.5], [frames // 2, 0.1, 0.2, 1.2], [frames - 1, -0.2, 0.1, 1.4]])
+    return Clip(video, depths, intrinsics, extrinsics, queries=queries)
+
+
+@pytest.mark.parametrize("frames", [3, 9])
+def test_a_long_clip_is_streamed_with_the_same_result(frames, monkeypatch):
+    tracker, clip = small_tracker(), small_clip(frames)
+    whole = tracker.track(clip, support_grid=2)
+    monkeypatch.setattr(inference, "_KEPT", 0)
+    streamed = tracker.track(clip, support_grid=2)
+    np.testing.assert_allclose(streamed.xyz, whole.xyz, atol=1e-4)
+    np.testing.assert_allclose(streamed.visible_logits, whole.visible_logits, atol=1e-4)
+
+
+def most_bytes(tracker, clip):
+    """Largest memory of tensors alive at an update, and how often the encoder saw a frame."""
+    most, encoded = [0], []
+
+    def weigh(*_):
+        alive = [x for x in gc.get_objects() if issubclass(type(x), torch.Tensor)]
+        storages = {x.untyped_storage().data_ptr(): x.untyped_storage().nbytes() for x in alive}
+        most[0] = max(most[0], sum(storages.values()))
+
+    hooks = [
+        tracker.updater.register_forward_hook(weigh),
+        tracker.encoder.register_forward_hook(lambda _, inputs, __: encoded.append(inputs[0].shape[1])),
+    ]
+    tracker.track(clip, support_grid=0)
+    for hook in hooks:
+        hook.remove()
+    return most[0], sum(encoded)
+
+
+def test_memory_hardly_grows_with_the_length_of_a_long_clip(monkeypatch):
+    tracker, frame = small_tracker(), 64 * 8 * 8 * 4  # bytes of the features of one frame
+    (short, once), (long, _) = (most_bytes(tracker, small_clip(frames)) for frames in (8, 24))
+    assert once == 8  # both directions share the features
+    assert long - short > 16 * frame
+    monkeypatch.setattr(inference, "_KEPT", 0)
+    (short, twice), (long, _) = (most_bytes(tracker, small_clip(frames)) for frames in (8, 24))
+    assert twice == 16
+    assert long - short < 16 * frame / 8

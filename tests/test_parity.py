@@ -3,9 +3,15 @@
 import pytest
 import torch
 
+from tapip3d_lite.model.tracker import Tracker
 from tests import parity
 
 needs_golden = pytest.mark.skipif(not parity.GOLDEN.is_dir(), reason="the recorded runs are not beside this checkout")
+
+
+@pytest.fixture(autouse=True, params=["fast", "clear"])
+def _form(request, monkeypatch):
+    monkeypatch.setattr(Tracker, "fast", request.param == "fast")
 
 
 @needs_golden

@@ -5,6 +5,9 @@ Paper: section 4 (protocol): a grid of support queries, depth's region of intere
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.queries import grid_queries, resolve_queries
 
+_KEPT = 2**27  # floats of features kept for a whole clip (512 MiB); of longer clips only a window's are
 _INTERCHANGEABLE = ("camera", "world")
 
 
@@ -33,6 +37,9 @@ def track(
     progress: bool = False,
 ) -> Tracks:
     """Track points through a clip.
+
+    Both directions share one run of the encoder, unless the features of the whole clip would take too much memory:
+    then frames are streamed, and encoded again for the way back. The numbers are the same.
 
     Args:
         tracker: a `Tracker`.
@@ -57,17 +64,16 @@ def track(
     check_options(tracker, space, depth_roi, visible_threshold, support_grid)
     queries = resolve_queries(clip, queries)
     clip = resize_clip(clip, tracker.config.image_size)
-    frames = frames_from_clip(clip, device=next(tracker.parameters()).device)
-    features = tracker.encoder(frames.rgb)
-    roi = quantile_roi(frames.depths) if isinstance(depth_roi, str) else depth_roi
+    roi = quantile_roi(torch.from_numpy(clip.depths)) if isinstance(depth_roi, str) else depth_roi
     options = {"iterations": iterations, "space": space, "depth_roi": roi}
     grids = [_grid(clip, support_grid, frame) for frame in (0, len(clip) - 1)]
     backward = bidirectional and bool((queries[:, 0] > 0).any())
+    ways = _ways(tracker, clip)
     with _bar(progress, tracker, len(clip), iterations, 1 + backward) as bar:
-        xyz, logits = _one_way(tracker, frames, features, queries, grids[0], options, bar)
+        xyz, logits = _one_way(tracker, ways[0], queries, grids[0], options, bar)
         if backward:
             flipped = [_flip_time(rows, len(clip)) for rows in (queries, grids[1])]
-            other = _one_way(tracker, frames.flip(), features.flip(1), *flipped, options, bar)
+            other = _one_way(tracker, ways[1], *flipped, options, bar)
             before = np.arange(len(clip))[:, None] < queries[:, 0]
             xyz = np.where(before[..., None], other[0][::-1], xyz)
             logits = np.where(before, other[1][::-1], logits)
@@ -75,16 +81,43 @@ def track(
     return Tracks(xyz, visible, queries, logits)
 
 
-def _one_way(
-    tracker: nn.Module, frames: Frames, features: Tensor, queries: np.ndarray, grid: np.ndarray, options: dict, bar: Any
+def _ways(tracker: nn.Module, clip: Clip) -> list[Callable[..., tuple[np.ndarray, np.ndarray]]]:
+    """Functions of (rows, **options) that track forward and backward in time."""
+    config = tracker.config
+    if len(clip) * config.feature_dim * math.prod(config.grid_sizes[0]) > _KEPT:
+        return [partial(_streamed, tracker, clip, range(len(clip))[::step]) for step in (1, -1)]
+    frames = frames_from_clip(clip, device=next(tracker.parameters()).device)
+    features = tracker.encoder(frames.rgb)
+    return [partial(_at_once, tracker, *pair) for pair in ((frames, features), (frames.flip(), features.flip(1)))]
+
+
+def _at_once(
+    tracker: nn.Module, frames: Frames, features: Tensor, rows: np.ndarray, **options: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    rows = torch.from_numpy(np.concatenate([queries, grid]).astype(np.float32)).to(frames.depths.device)
+    queries = torch.from_numpy(rows).to(frames.depths.device)
+    xyz, logits = tracker(frames, queries[None], features=features, **options)
+    return xyz[0].cpu().numpy(), logits[0].cpu().numpy()
+
+
+def _streamed(
+    tracker: nn.Module, clip: Clip, order: range, rows: np.ndarray, **options: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    stream = tracker.stream(rows, **options)
+    for i in order:
+        stream.push(clip.video[i], clip.depths[i], clip.intrinsics[i], clip.extrinsics[i])
+    tracks = stream.finish()
+    return tracks.xyz, tracks.visible_logits
+
+
+def _one_way(
+    tracker: nn.Module, way: Callable, queries: np.ndarray, grid: np.ndarray, options: dict, bar: Any
+) -> tuple[np.ndarray, np.ndarray]:
     handle = tracker.updater.register_forward_hook(lambda *_: bar.update())
     try:
-        xyz, logits = tracker(frames, rows[None], features=features, **options)
+        xyz, logits = way(np.concatenate([queries, grid]).astype(np.float32), **options)
     finally:
         handle.remove()
-    return xyz[0, :, : len(queries)].cpu().numpy(), logits[0, :, : len(queries)].cpu().numpy()
+    return xyz[:, : len(queries)], logits[:, : len(queries)]
 
 
 def _grid(clip: Clip, side: int, frame: int) -> np.ndarray:

@@ -114,7 +114,7 @@ class Stream:
     def _push(self, frames: Frames, features: Tensor) -> Tracks | None:
         state, size, now = self.state, self.tracker.config.window, self.seen
         flat = getattr(self.space, "moves", (1.0, 1.0, 1.0))[2] == 0
-        depth = frames.depths if flat else frames.depths[..., :1, :1]  # only flat spaces need it once lifted
+        depth = frames.depths if flat else frames.depths[..., :1, :1].clone()  # only flat spaces need it once lifted
         self.cameras.append((frames.intrinsics, frames.extrinsics, depth))
         arriving = state.times[0] == now
         if bool(arriving.any()):
