@@ -20,6 +20,7 @@ _HOMES = {
     "trackers": ["list_trackers", "load_tracker"],
     "model.config": ["TrackerConfig"],
     "model.official": ["from_official_state"],
+    "model.recorder": ["Recorder"],
     "model.tracker": ["Tracker"],
     "model.weights": ["load_official", "load_weights", "save_weights"],
 }

@@ -44,7 +44,7 @@ def offline_frame_by_frame(tracker, clip, **options):
     return xyz[0].numpy(), logits[0].numpy()
 
 
-@pytest.mark.parametrize("space", ["world", "camera"])
+@pytest.mark.parametrize("space", ["world", "camera", "first"])
 @pytest.mark.parametrize("frames", [2, 3, 8, 11])
 def test_stream_equals_offline(tracker, clip, space, frames):
     part = clip.cut(0, frames)
@@ -109,7 +109,7 @@ def test_stream_without_frames_or_with_a_bad_frame(tracker, clip):
         ({"queries": [[-1.0, 0, 0, 1]]}, "whole frame number"),
         ({"queries": [[0, np.nan, 0, 1]]}, "finite"),
         ({"depth_roi": "auto"}, "does not know the whole clip"),
-        ({"space": "uvd"}, "only camera and world"),
+        ({"space": "uvd"}, "only camera, world and first"),
         ({"iterations": 0}, "iterations"),
         ({"visible_threshold": 2}, "probability"),
     ],

@@ -199,7 +199,7 @@ def cameras_of(clip):
 def test_image_spaces_invert(space):
     clip = t3d.simulate_clip(seed=1, frames=3, size=(48, 48), tracks=20)
     k, e, d = cameras_of(clip)
-    space = {"uvlogd": UVLogD(), "uvd": UVD().fit(d[:1]), "uvd as it is": UVD()}[space]
+    space = {"uvlogd": UVLogD(), "uvd": UVD().fit(d[:1], e[:1]), "uvd as it is": UVD()}[space]
     xyz = torch.from_numpy(clip.queries[:, 1:]).expand(3, -1, -1)
     coords = space.from_world(xyz[None], k[None], e[None])[0]
     torch.testing.assert_close(space.to_world(coords[None], k[None], e[None], d[None])[0], xyz, atol=1e-4, rtol=1e-4)
@@ -214,14 +214,14 @@ def test_uvd_stretches_each_clips_depth_to_the_width_whatever_the_unit():
     depths[1] *= 1000
     depths[:, :3] = 0  # holes
     depths[:, 4, :2] = 1e6  # a little sky does not count
-    space = UVD().fit(depths)
+    space = UVD().fit(depths, torch.eye(4)[None])
     third = space.lift(depths[:, None], torch.eye(3).expand(2, 1, 3, 3), torch.eye(4))[..., 2]
     inside = (depths > 0) & (depths < 1e5)
     for b in range(2):
         values = third[b, 0][inside[b]]
         assert float(values.min()) == pytest.approx(0, abs=1e-2)
         assert float(values.max()) == pytest.approx(30, abs=1)
-    empty = UVD().fit(torch.zeros(1, 4, 4))
+    empty = UVD().fit(torch.zeros(1, 4, 4), torch.eye(4)[None])
     assert torch.isfinite(empty.lift(torch.zeros(1, 1, 4, 4), torch.eye(3), torch.eye(4))).all()
 
 

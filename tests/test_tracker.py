@@ -148,10 +148,12 @@ def moved(golden, pose):
     return frames, queries
 
 
-def test_a_rigid_motion_of_scene_and_cameras_moves_camera_tracks_with_it(golden):
-    pose = rigid(0)
-    xyz, _ = run(golden, space="camera", iterations=1)
-    other, _ = run(golden, *moved(golden, pose), space="camera", iterations=1)
+@pytest.mark.parametrize("space", ["camera", "first"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_rigid_motion_of_scene_and_cameras_moves_the_tracks_with_it(golden, space, seed):
+    pose = rigid(seed)
+    xyz, _ = run(golden, space=space, iterations=1)
+    other, _ = run(golden, *moved(golden, pose), space=space, iterations=1)
     assert (xyz - golden.queries[:, None, :, 1:]).abs().max() > 0.05  # there is motion to compare
     assert torch.allclose(other, transform(xyz, pose), atol=1e-4)
 
@@ -162,6 +164,22 @@ def test_a_translation_of_the_world_moves_world_tracks_with_it(golden):
     xyz, _ = run(golden, iterations=1)
     other, _ = run(golden, *moved(golden, pose), iterations=1)
     assert torch.allclose(other, transform(xyz, pose), atol=1e-4)
+
+
+def test_a_rotation_of_the_world_is_seen_in_world_but_not_in_first(golden):
+    pose = rigid(2)
+    pose[:3, 3] = 0
+    xyz, _ = run(golden, iterations=1)
+    other, _ = run(golden, *moved(golden, pose), iterations=1)
+    assert not torch.allclose(other, transform(xyz, pose), atol=1e-2)  # the released model reads axis by axis
+    first = dataclasses.replace(
+        golden.frames, extrinsics=golden.frames.extrinsics @ invert(golden.frames.extrinsics[:, :1])
+    )
+    queries = torch.cat(
+        [golden.queries[..., :1], transform(golden.queries[..., 1:], golden.frames.extrinsics[:, 0])], -1
+    )
+    world, _ = run(golden, first, queries, iterations=1)
+    assert torch.allclose(run(golden, first, queries, space="first", iterations=1)[0], world, atol=1e-5)
 
 
 def test_world_and_camera_differ_only_by_the_cameras_motion(golden):
@@ -393,7 +411,7 @@ def test_resized_depth_mixes_valid_pixels_only():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"space": "uvd"}, "only camera and world"),
+        ({"space": "uvd"}, "only camera, world and first"),
         ({"visible_threshold": 3}, "probability"),
         ({"support_grid": -1}, "support_grid"),
         ({"depth_roi": "near"}, "depth_roi"),

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 CHOICES = {
-    "space": ("uv", "uvd", "uvlogd", "camera", "world"),
+    "space": ("uv", "uvd", "uvlogd", "camera", "world", "first"),
     "neighborhood": ("knn", "window", "planes"),
     "context": ("n2n", "p2n", "correlation", "planes"),
     "updater": ("transformer", "temporal"),

@@ -20,7 +20,7 @@ from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.queries import grid_queries, resolve_queries
 
 _KEPT = 2**27  # floats of features kept for a whole clip (512 MiB); of longer clips only a window's are
-_INTERCHANGEABLE = ("camera", "world")
+_INTERCHANGEABLE = ("camera", "world", "first")
 
 
 @torch.no_grad()
@@ -144,7 +144,7 @@ def check_options(tracker: nn.Module, space: Any, roi: Any, threshold: float, gr
     own = tracker.config.space
     if space not in (None, own) and not (own in _INTERCHANGEABLE and space in _INTERCHANGEABLE):
         raise ValueError(
-            f"space: this tracker was made for {own!r}, got {space!r}; only camera and world are exchangeable"
+            f"space: this tracker was made for {own!r}, got {space!r}; only camera, world and first are exchangeable"
         )
     if isinstance(roi, str) and roi != "auto":
         raise ValueError(f'depth_roi: expected "auto", None or (near, far), got {roi!r}')

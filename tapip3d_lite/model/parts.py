@@ -11,11 +11,11 @@ from tapip3d_lite.model.contexts import N2N, P2N
 from tapip3d_lite.model.correlations import Correlation, PlaneCorrelation
 from tapip3d_lite.model.grids import Planes, Window
 from tapip3d_lite.model.neighbors import KNearest
-from tapip3d_lite.model.spaces import UV, UVD, Camera, UVLogD, World
+from tapip3d_lite.model.spaces import UV, UVD, Camera, First, UVLogD, World
 from tapip3d_lite.model.updater import Temporal, Transformer
 
 PARTS: dict[str, dict[str, type]] = {
-    "space": {"uv": UV, "uvd": UVD, "uvlogd": UVLogD, "camera": Camera, "world": World},
+    "space": {"uv": UV, "uvd": UVD, "uvlogd": UVLogD, "camera": Camera, "world": World, "first": First},
     "neighborhood": {"knn": KNearest, "window": Window, "planes": Planes},
     "context": {"n2n": N2N, "p2n": P2N, "correlation": Correlation, "planes": PlaneCorrelation},
     "updater": {"transformer": Transformer, "temporal": Temporal},

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from tapip3d_lite.geometry import invert, pixel_grid, point_map, project, transform, unproject
 from tapip3d_lite.model.cloud import quantile_roi
+from tapip3d_lite.model.frames import Frames
 from tapip3d_lite.model.neighbors import knn
 
 
@@ -27,8 +28,8 @@ class Space:
     name = "world"
     moves = (1.0, 1.0, 1.0)  # axes along which a trajectory may move
 
-    def fit(self, depths: Tensor) -> Space:
-        """The space for clips whose first frames have depths (B, H, W); only `uvd` depends on them."""
+    def fit(self, depths: Tensor, extrinsics: Tensor) -> Space:
+        """The space for clips whose first frames have depths (B, H, W) (for `uvd`) and poses (B, 4, 4) (for `first`)."""
         return self
 
     def lift(self, depths: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:
@@ -59,6 +60,39 @@ class Space:
 
 class World(Space):
     """World coordinates."""
+
+
+class First(Space):
+    """World coordinates told in the frame of the clip's first camera.
+
+    The model reads offsets and motion axis by axis, so in `world` its answer depends on how the world's axes happen to
+    lie. Here it does not: moving scene and cameras by any rigid motion moves the tracks by it.
+    """
+
+    name = "first"
+    anchor: Tensor  # (B, 4, 4), world to first camera
+
+    def fit(self, depths: Tensor, extrinsics: Tensor) -> Space:
+        """See `Space.fit`."""
+        space = First()
+        space.anchor = extrinsics[:, None]
+        return space
+
+    def lift(self, depths: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:
+        """See `Space.lift`."""
+        return point_map(depths, intrinsics, extrinsics @ invert(self.anchor))
+
+    def from_world(self, xyz: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:
+        """See `Space.from_world`."""
+        return transform(xyz, self.anchor)
+
+    def to_world(self, coords: Tensor, intrinsics: Tensor, extrinsics: Tensor, depths: Tensor) -> Tensor:
+        """See `Space.to_world`."""
+        return transform(coords, invert(self.anchor))
+
+    def to_pixels(self, coords: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:
+        """See `Space.to_pixels`."""
+        return project(coords, intrinsics, extrinsics @ invert(self.anchor))[0]
 
 
 class Camera(Space):
@@ -128,7 +162,7 @@ class UVD(UVLogD):
     def __init__(self, near: Tensor | float = 0.0, unit: Tensor | float = 1.0) -> None:
         self.near, self.unit = torch.as_tensor(near), torch.as_tensor(unit)
 
-    def fit(self, depths: Tensor) -> UVD:
+    def fit(self, depths: Tensor, extrinsics: Tensor) -> UVD:
         """Near and far of each clip's first frame, outliers (sky) left out; later frames are not known to a stream."""
         ranges = [_depth_range(depth) for depth in depths]
         near, far = (torch.tensor(x, dtype=depths.dtype, device=depths.device) for x in zip(*ranges, strict=True))
@@ -163,9 +197,9 @@ def _focal(intrinsics: Tensor) -> Tensor:
     return (intrinsics[..., 0, 0] * intrinsics[..., 1, 1]).sqrt().unsqueeze(-1)
 
 
-def fitted(space: Any, depths: Tensor) -> Any:
-    """A space for clips whose first frames have depths (B, H, W); custom spaces need no `fit`."""
-    return space.fit(depths) if hasattr(space, "fit") else space
+def fitted(space: Any, frames: Frames) -> Any:
+    """A space for the clips whose frames these are; custom spaces need no `fit`."""
+    return space.fit(frames.depths[:, 0], frames.extrinsics[:, 0]) if hasattr(space, "fit") else space
 
 
 def _per_clip(value: Tensor, like: Tensor) -> Tensor:

@@ -90,7 +90,7 @@ class Stream:
         clip = resize_clip(clip, self.tracker.config.image_size)
         frames = frames_from_clip(clip, device=self.rows.device)
         if self.seen == 0:
-            self.space = fitted(self.space, frames.depths[:, 0])
+            self.space = fitted(self.space, frames)
             grid = grid_queries(clip, self.grid) if self.grid else self.queries[:0]
             self._begin(np.concatenate([self.queries, grid]))
         with torch.no_grad():

@@ -68,7 +68,7 @@ class Tracker(nn.Module):
             xyz (B, T, N, 3), world, and visibility logits (B, T, N). Before a query's first window, and in clips of
             at most S / 2 frames, the query's position and 0.
         """
-        space = fitted(make_space(options.get("space") or self.space), frames.depths[:, 0])
+        space = fitted(make_space(options.get("space") or self.space), frames)
         state = State.start(queries, frames, space, self.config.window // 2)
         for _ in self.steps(frames, queries, state=state, **(options | {"space": space})):
             pass
@@ -103,7 +103,7 @@ class Tracker(nn.Module):
         self._check(frames, iterations)
         if queries.shape[1] == 0:
             return
-        space, half = fitted(make_space(space or self.space), frames.depths[:, 0]), config.window // 2
+        space, half = fitted(make_space(space or self.space), frames), config.window // 2
         features = self.encoder(frames.rgb) if features is None else features
         state = State.start(queries, frames, space, half) if state is None else state
         scene = self.scene(frames, features, space, depth_roi)
