@@ -28,7 +28,9 @@ def tags(cell):
 
 def run(nb, folder=FOLDER, timeout=300):
     """Execute a notebook in place; raises at the first cell that fails."""
-    NotebookClient(nb, timeout=timeout, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
+    place = {"metadata": {"path": str(folder)}}
+    # The kernel cuts printed text by the clock; joined, it is the same in every run.
+    NotebookClient(nb, timeout=timeout, kernel_name="python3", resources=place, coalesce_streams=True).execute()
     return nb
 
 
@@ -42,7 +44,7 @@ def clean(nb):
         cell.metadata = {key: cell.metadata[key] for key in ("tags", "jupyter") if key in cell.metadata}
         if cell.cell_type != "code":
             continue
-        cell.outputs = _joined([o for o in cell.outputs if not (o.output_type == "stream" and o.name == "stderr")])
+        cell.outputs = [o for o in cell.outputs if not (o.output_type == "stream" and o.name == "stderr")]
         for output in cell.outputs:
             if "text" in output:
                 output.text = _PATHS.sub(lambda m: m.group().rsplit("/", 1)[-1], output.text)
@@ -56,17 +58,6 @@ def clean(nb):
             if "metadata" in output:  # a stream has none
                 output.metadata = {}
     return nb
-
-
-def _joined(outputs):
-    """Runs of printed text as one output each; the kernel cuts them by the clock, which would make every run a change."""
-    joined = []
-    for output in outputs:
-        if joined and output.output_type == joined[-1].output_type == "stream":
-            joined[-1].text += output.text
-        else:
-            joined.append(output)
-    return joined
 
 
 def solution_copy(nb):

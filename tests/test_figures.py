@@ -184,8 +184,13 @@ def test_explorer_redraws_with_the_values_of_its_controls():
     box = explore(draw, frame=(0, 9), space=["world", "camera"], noise=(0.0, 1.0))
     frame, space, _ = box.children[0].children
     space.value = "camera"
+    _, picture, refusal = box.children
+    assert bytes(picture.value).startswith(b"\x89PNG") and picture.layout.display is None
     frame.value = 9
     assert calls == [(4, "world", 0.5), (4, "camera", 0.5), (9, "camera", 0.5)]
+    assert refusal.value == "no such frame" and picture.layout.display == "none"
+    frame.value = 3
+    assert refusal.value == "" and picture.layout.display is None
 
 
 def test_png_is_deterministic(clip):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Sequence
 
 import ipywidgets as widgets
-from IPython.display import Image, display
 from matplotlib.figure import Figure
 
 from tapip3d_lite.ui.figures import png_bytes
@@ -25,21 +25,21 @@ def explore(draw: Callable[..., Figure], **controls: Control) -> widgets.VBox:
         The controls above the figure. A `ValueError` of `draw` is shown instead of the figure.
     """
     boxes = {name: _control(name, values) for name, values in controls.items()}
-    output = widgets.Output()
+    # An image, not an Output: programs that run notebooks (nbclient) may wait long for messages that Outputs send.
+    picture, refusal = widgets.Image(format="png", layout={"align_self": "flex-start"}), widgets.HTML()
 
     def redraw(_change: object = None) -> None:
         try:
-            picture: object = Image(png_bytes(draw(**{name: box.value for name, box in boxes.items()})))
+            picture.value = png_bytes(draw(**{name: box.value for name, box in boxes.items()}))
+            refusal.value = ""
         except ValueError as error:
-            picture = f"{error}"
-        with output:
-            output.clear_output(wait=True)
-            display(picture)
+            refusal.value = html.escape(str(error))
+        picture.layout.display = "none" if refusal.value else None
 
     for box in boxes.values():
         box.observe(redraw, names="value")
     redraw()
-    return widgets.VBox([widgets.HBox(list(boxes.values()), layout={"flex_flow": "row wrap"}), output])
+    return widgets.VBox([widgets.HBox(list(boxes.values()), layout={"flex_flow": "row wrap"}), picture, refusal])
 
 
 def _control(name: str, values: Control) -> widgets.Widget:
