@@ -6,7 +6,7 @@ import re
 import nbformat
 import pytest
 
-from tests.notebook_tools import clean, notebooks, run, solution_copy, solution_of, tags
+from tests.notebook_tools import ROOT, clean, notebooks, run, solution_copy, solution_of, tags
 
 NOTEBOOKS = notebooks()
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
@@ -49,7 +49,7 @@ def test_outputs_are_fresh_and_clean(path):
         assert not (output.output_type == "stream" and output.name == "stderr"), cell.source
     text = json.dumps([o for _, o in outputs(nb)])
     assert not re.search(r"(?<![\w.])(/home/|/root/|/tmp/|/Users/|[A-Z]:\\\\)", text)
-    assert str(FOLDER.parent) not in text
+    assert str(ROOT) not in text
     assert "widgets" not in nb.metadata and "widget-view" not in text
     assert path.stat().st_size < 2e6
 
