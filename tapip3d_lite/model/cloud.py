@@ -5,7 +5,7 @@ Paper: section 3.2 ("spatio-temporal feature clouds") and appendix (normalisatio
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -22,12 +22,14 @@ class Level:
         points: (B, T, h, w, 3) in the trajectory's space.
         valid: (B, T, h, w) bool, whether the cell's depth is known.
         extra: anything that a context's `prepare` adds for its neighbourhood (e.g. feature planes).
+        memory: what neighbourhoods made of the points, e.g. a search tree; copies with other points start empty.
     """
 
     features: Tensor
     points: Tensor
     valid: Tensor
     extra: Any = None
+    memory: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def cells(self, uv: Tensor, size: tuple[int, int]) -> Tensor:
         """Pixels (..., 2) of images (H, W) in units of cells, (u w / W, v h / H): the features' convention."""

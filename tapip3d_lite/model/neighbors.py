@@ -15,8 +15,10 @@ from torch import Tensor, nn
 
 from tapip3d_lite.model.cloud import Level, Normalizer
 from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.organized import BlockTree
 
 _BUDGET = 2**24  # distances that exist at once: 64 MiB in float32
+_FEW = 2**16  # distances that are computed sooner than a tree is searched
 
 
 @dataclass(frozen=True)
@@ -71,11 +73,19 @@ class KNearest(nn.Module):
         """
         shape = coords.shape[:2]
         points, features = level.points.flatten(2, 3).flatten(0, 1), level.features.flatten(2, 3).flatten(0, 1)
-        valid = level.valid.flatten(2).flatten(0, 1) if self.exclude_invalid else None
         with torch.no_grad():
-            indices = knn(coords.flatten(0, 1), points, self.count, valid)  # (B*S, N, K)
+            indices = self._search(level, coords.flatten(0, 1), points)  # (B*S, N, K)
         near = (gather(x, indices).unflatten(0, shape) for x in (features, points))
         return Neighbors(*near, coords, indices.unflatten(0, shape))
+
+    def _search(self, level: Level, queries: Tensor, points: Tensor) -> Tensor:
+        valid = level.valid.flatten(0, 1) if self.exclude_invalid else None
+        if queries.shape[:2].numel() * points.shape[1] > _FEW:
+            if "tree" not in level.memory:
+                level.memory["tree"] = BlockTree.build(level.points.flatten(0, 1), valid)
+            if level.memory["tree"] is not None:
+                return level.memory["tree"].knn(queries, self.count)
+        return knn(queries, points, self.count, None if valid is None else valid.flatten(1))
 
 
 def gather(values: Tensor, indices: Tensor) -> Tensor:
