@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tapip3d_lite.simulate.config import SimulationConfig
 from tapip3d_lite.simulate.dataset import simulate_dataset
-from tapip3d_lite.simulate.simulator import simulate_clip
+from tapip3d_lite.simulate.recording import Recording
+from tapip3d_lite.simulate.simulator import record, render_clip, simulate_clip
 
-__all__ = ["SimulationConfig", "simulate_clip", "simulate_dataset"]
+__all__ = ["Recording", "SimulationConfig", "record", "render_clip", "simulate_clip", "simulate_dataset"]

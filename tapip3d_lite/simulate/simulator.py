@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -11,6 +11,7 @@ from tapip3d_lite.clip import Clip
 from tapip3d_lite.simulate.cameras import random_path
 from tapip3d_lite.simulate.config import SimulationConfig
 from tapip3d_lite.simulate.physics import UnstableSceneError, geom_poses, roll_out
+from tapip3d_lite.simulate.recording import Recording
 from tapip3d_lite.simulate.render import Hits, pixel_rays, render_color, render_depth, to_bytes
 from tapip3d_lite.simulate.scene import Scene, random_scene
 from tapip3d_lite.simulate.tracks import make_tracks, moving_geoms, sample_pixels
@@ -43,13 +44,37 @@ def simulate_clip(seed: int = 0, config: SimulationConfig | None = None, **overr
         >>> clip.depths.shape
         (2, 32, 32)
     """
-    config = make_config(config, **overrides)
+    return _film_all(*_record(seed, make_config(config, **overrides)))
+
+
+def record(seed: int = 0, config: SimulationConfig | None = None, **overrides: object) -> Recording:
+    """The roll-out of `simulate_clip` with the same arguments, which `render_clip` turns into the same clip."""
+    return _record(seed, make_config(config, **overrides))[0]
+
+
+def render_clip(recording: Recording) -> Clip:
+    """Film a recording; no physics is computed, so that every machine gets the same clip.
+
+    Raises:
+        ValueError: the scene that the seed makes here has other bodies than the recording's.
+    """
+    rng = np.random.default_rng([recording.attempt, recording.seed])
+    scene = random_scene(rng, recording.config, random_path(rng, recording.config).azimuth.mean())
+    if recording.states.shape[2] != scene.model.nq:
+        raise ValueError(
+            f"render_clip: seed {recording.seed} makes a scene with {scene.model.nq} positions here, the recording has "
+            f"{recording.states.shape[2]}; it was made by another version of the simulator"
+        )
+    return _film_all(recording, _shoot(scene, recording))
+
+
+def _record(seed: int, config: SimulationConfig) -> tuple[Recording, Shots]:
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"simulate_clip: seed must be a whole number of at least 0, got {seed!r}")
     failure = None
     for attempt in range(ATTEMPTS):
         try:
-            return _attempt(np.random.default_rng([attempt, seed]), config, seed)
+            return _attempt(int(seed), attempt, config)
         except UnstableSceneError as error:  # noqa: PERF203 (a failure is what the loop is for)
             failure = error
     raise ValueError(
@@ -67,35 +92,60 @@ def make_config(config: SimulationConfig | None = None, **overrides: object) -> 
     return replace(config or SimulationConfig(), **overrides)
 
 
-def _attempt(rng: np.random.Generator, config: SimulationConfig, seed: int) -> Clip:
+@dataclass(frozen=True)
+class Shots:
+    """What rays through the pixel centres met: poses (T, G, 4, 4), depths (T, H, W) float64, T hits."""
+
+    scene: Scene
+    poses: np.ndarray
+    depths: np.ndarray
+    hits: list[Hits]
+
+
+def _attempt(seed: int, attempt: int, config: SimulationConfig) -> tuple[Recording, Shots]:
+    rng = np.random.default_rng([attempt, seed])
     path = random_path(rng, config)
     scene = random_scene(rng, config, path.azimuth.mean())
     offsets = np.linspace(-0.25, 0.25, 5) if config.motion_blur else np.zeros(1)
     states = roll_out(scene, config.frames, config.fps, offsets)
-    center = len(offsets) // 2
-    poses = geom_poses(scene, states[:, center])
-    moving = moving_geoms(scene, poses)
     # Stored float32 poses are the truth: everything is rendered with exactly these.
-    extrinsics = path.extrinsics(np.arange(config.frames)[:, None] + offsets).astype(np.float32).astype(float)
-    intrinsics = path.intrinsics.astype(np.float32).astype(float)
-    depths, hits = _measure(scene, config, states[:, center], intrinsics, extrinsics[:, center])
-    geom = np.stack([h.geom.reshape(config.size) for h in hits])
-    _check_view(scene, geom, depths, moving)
+    extrinsics = path.extrinsics(np.arange(config.frames)[:, None] + offsets).astype(np.float32)
+    intrinsics = path.intrinsics.astype(np.float32)
+    recording = Recording(seed, attempt, config, states, intrinsics, extrinsics, np.zeros((0, 3), np.int16))
+    shots = _shoot(scene, recording)
+    moving = moving_geoms(scene, shots.poses)
+    geom = np.stack([h.geom.reshape(config.size) for h in shots.hits])
+    _check_view(scene, geom, shots.depths, moving)
+    pixels = sample_pixels(rng, geom, moving, config.tracks, config.share_dynamic)
+    return replace(recording, pixels=pixels.astype(np.int16)), shots
+
+
+def _shoot(scene: Scene, recording: Recording) -> Shots:
+    center = recording.states.shape[1] // 2
+    states, extrinsics = recording.states[:, center], recording.extrinsics[:, center].astype(float)
+    depths, hits = _measure(scene, recording.config, states, recording.intrinsics.astype(float), extrinsics)
+    return Shots(scene, geom_poses(scene, states), depths, hits)
+
+
+def _film_all(recording: Recording, shots: Shots) -> Clip:
+    config, scene, states = recording.config, shots.scene, recording.states
+    intrinsics, extrinsics = recording.intrinsics.astype(float), recording.extrinsics.astype(float)
+    center = states.shape[1] // 2
     extras = {}
     if config.stereo_baseline:
         right = extrinsics.copy()
         right[..., 0, 3] -= config.stereo_baseline
         extras["video_right"] = _film(scene, config, states, intrinsics, right)
         extras["stereo_baseline"] = np.float32(config.stereo_baseline)
-    pixels = sample_pixels(rng, geom, moving, config.tracks, config.share_dynamic)
-    tracks = make_tracks(scene, states[:, center], poses, hits, depths, intrinsics, extrinsics[:, center], pixels)
+    cameras, pixels = (intrinsics, extrinsics[:, center]), recording.pixels.astype(int)
+    tracks = make_tracks(scene, states[:, center], shots.poses, shots.hits, shots.depths, *cameras, pixels)
     return Clip(
         video=_film(scene, config, states, intrinsics, extrinsics),
-        depths=depths.astype(np.float32),
+        depths=shots.depths.astype(np.float32),
         intrinsics=np.repeat(intrinsics[None], config.frames, 0),
         extrinsics=extrinsics[:, center],
         tracks=tracks,
-        name=f"simulated_{seed}",
+        name=f"simulated_{recording.seed}",
         fps=config.fps,
         extras=extras,
     )

@@ -1,0 +1,8 @@
+"""Which seeds are for what, so that no clip that scores a tracker is ever drawn to train one."""
+
+from __future__ import annotations
+
+SAMPLES = range(0, 1_000)  # sample clips, examples, tests
+BENCHMARK = range(20_000, 50_000)  # the Lite benchmark; each split takes a thousand
+VALIDATION = range(50_000, 51_000)  # held-out clips that a training looks at now and then
+TRAINING = range(100_000, 2**31)
