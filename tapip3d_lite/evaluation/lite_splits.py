@@ -1,0 +1,185 @@
+"""The Lite benchmark's clips: three splits that are stored as roll-outs, filmed here, and checked against fingerprints.
+
+The files beside this module hold what physics produced, so that every machine scores the same clips; each clip's
+fingerprint tells when a change of the renderer would silently change them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from tapip3d_lite.clip import Clip, load_clip
+from tapip3d_lite.simulate import Recording, SimulationConfig, record, render_clip
+from tapip3d_lite.simulate.recording import load_recordings, save_recordings
+from tapip3d_lite.simulate.seeds import BENCHMARK
+
+FOLDER = Path(__file__).parent / "lite_benchmark"
+SPLITS = ("static-camera", "moving-camera", "occlusion")
+COUNT = 16
+SLACK = {"tracks": 2, "depths": 4, "visible": 0, "video": 4}  # millimetres, millimetres, bits, grey levels
+
+
+def split_config(split: str, index: int) -> SimulationConfig:
+    """The settings of a split's clip; its seed is `split_seed`.
+
+    Raises:
+        ValueError: unknown split.
+    """
+    check_split(split)
+    if split == "static-camera":
+        return SimulationConfig(camera="static")
+    if split == "moving-camera":
+        return SimulationConfig(camera=("linear", "arc", "handheld")[index % 3], handheld=2.0)
+    camera = ("static", "linear", "arc", "handheld")[index % 4]
+    return SimulationConfig(camera=camera, occluder=True, moving=(8, 12), resting=(2, 6), speed=1.4)
+
+
+def split_seed(split: str, index: int) -> int:
+    """The seed of a split's clip: the splits take successive seeds from a thousand each."""
+    check_split(split)
+    return BENCHMARK.start + 1000 * SPLITS.index(split) + index
+
+
+def check_split(split: str) -> None:
+    """Refuse an unknown split.
+
+    Raises:
+        ValueError: it is none of `SPLITS`.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split!r}; choose one of them")
+
+
+def write_split(split: str, folder: str | Path = FOLDER, count: int = COUNT) -> Path:
+    """Simulate a split anew and store it; the scores of the benchmark change with it, so this is for its makers only."""
+    recordings = [record(split_seed(split, index), split_config(split, index)) for index in range(count)]
+    path = Path(folder) / f"{split}.npz"
+    save_recordings(path, recordings, [fingerprint(render_clip(recording)) for recording in recordings])
+    return path
+
+
+def fingerprint(clip: Clip) -> dict[str, np.ndarray]:
+    """A few thousand numbers by which to tell a clip from another: tracks and depth in millimetres, colours, visibility."""
+    some = (slice(None, None, 8), slice(4, None, 8), slice(4, None, 8))
+    return {
+        "tracks": np.rint(1000 * clip.tracks.xyz[::8, ::2]).astype(np.int16),
+        "depths": np.rint(1000 * clip.depths[some]).astype(np.int16),
+        "visible": np.packbits(clip.tracks.visible),
+        "video": clip.video[some],
+    }
+
+
+def differences(clip: Clip, stored: dict[str, np.ndarray], share: float = 0.01) -> list[str]:
+    """What of a clip is not as in a fingerprint, up to rounding and a share of values on edges of bodies."""
+    found = []
+    for name, now in fingerprint(clip).items():
+        if now.shape != stored[name].shape:
+            found.append(f"{name}: shape {now.shape} in place of {stored[name].shape}")
+            continue
+        other = (np.abs(now.astype(int) - stored[name].astype(int)) > SLACK[name]).mean()
+        if other > share:
+            found.append(f"{name}: {other:.1%} of the values differ")
+    return found
+
+
+def benchmark_clips(
+    split: str,
+    count: int | None = None,
+    cache: str | Path | None = None,
+    workers: int | None = None,
+    progress: bool = True,
+    folder: str | Path = FOLDER,
+) -> list[Clip]:
+    """The clips of a split, named `<split>-<index>`; filmed when first asked for, then read from a cache.
+
+    A script that calls this with several workers needs the usual `if __name__ == "__main__":`.
+
+    Args:
+        split: one of `SPLITS`.
+        count: only the first so many clips.
+        cache: folder for the filmed clips (1 MB each); `cache_folder()` if None.
+        workers: processes; None for one per core.
+        progress: show a bar while filming.
+        folder: where the stored roll-outs lie.
+
+    Raises:
+        ValueError: unknown split, bad count, or this renderer films something else than what was stored.
+    """
+    check_split(split)
+    if count is not None and count < 1:
+        raise ValueError(f"benchmark_clips: count must be at least 1, got {count}; leave it out for all clips")
+    path, cache = Path(folder) / f"{split}.npz", Path(cache or cache_folder())
+    stored, key = load_recordings(path)[:count], _key(path)
+    jobs = [
+        (cache / f"{split}-{index:02d}-{key}.npz", f"{split}-{index:02d}", recording, marks)
+        for index, (recording, marks) in enumerate(stored)
+    ]
+    clips = {job[1]: _cached(job) for job in jobs}
+    missing = [job for job in jobs if clips[job[1]] is None]
+    for name in _film(missing, workers or os.cpu_count() or 1, progress):
+        clips[name] = None
+    return [clips[job[1]] or load_clip(job[0]) for job in jobs]
+
+
+def cache_folder() -> Path:
+    """Where filmed clips are kept: `$XDG_CACHE_HOME/tapip3d_lite/benchmark`, by default under `~/.cache`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tapip3d_lite" / "benchmark"
+
+
+Job = tuple[Path, str, Recording, dict[str, np.ndarray]]
+
+
+def _key(path: Path) -> str:
+    """What the cached clips depend on: the stored roll-outs, the renderer's source, and what it computes with."""
+    sources = sorted((Path(__file__).parents[1] / "simulate").glob("*.py"))
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in (path, *sources)))
+    digest.update(f"{version('mujoco')} {version('numpy')}".encode())
+    return digest.hexdigest()[:12]
+
+
+def _cached(job: Job) -> Clip | None:
+    """The clip from the cache, or None where it is absent, damaged or not what was stored."""
+    try:
+        clip = load_clip(job[0])
+    except ValueError:
+        return None
+    return clip if clip.tracks is not None and not differences(clip, job[3]) else None
+
+
+def _film(jobs: list[Job], workers: int, progress: bool) -> Iterator[str]:
+    """Film clips into the cache and tell the name of each when it is there."""
+    with tqdm(total=len(jobs), desc="filming", unit="clip", disable=not (progress and jobs)) as bar:
+        if min(workers, len(jobs)) > 1:
+            with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs))) as pool:
+                for name in pool.imap_unordered(_film_one, jobs):
+                    bar.update()
+                    yield name
+        else:
+            for job in jobs:
+                yield _film_one(job)
+                bar.update()
+
+
+def _film_one(job: Job) -> str:
+    path, name, recording, marks = job
+    clip = replace(render_clip(recording), name=name)
+    wrong = differences(clip, marks)
+    if wrong:
+        raise ValueError(
+            f"benchmark clip {name}: what is filmed here is not what the benchmark holds ({'; '.join(wrong)}); "
+            "scores would not be comparable; use the versions of mujoco and tapip3d_lite that the benchmark was made with"
+        )
+    clip.save(path)
+    for old in path.parent.glob(f"{name}-*.npz"):  # filmed by an earlier version
+        if old != path:
+            old.unlink(missing_ok=True)
+    return name
