@@ -73,6 +73,30 @@ def evaluate(
     print(score_table(rows | means, ("AJ3D", "APD3D", "OA", "AJ3D_none", "APD3D_none", "AJ3D_none_dynamic")))
 
 
+def benchmark(
+    tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("static", "klt"),
+    split: Annotated[tuple[str, ...], arg(help="static-camera, moving-camera, occlusion; default: all")] = (),
+    space: Annotated[tuple[str, ...], arg(help="world, camera or both (learnt trackers)")] = ("world",),
+    count: Annotated[int | None, arg(help="only the first so many clips of each split")] = None,
+    out: Annotated[Path | None, arg(help="JSON with every clip's scores; an interrupted run is continued")] = None,
+    figure: Annotated[Path | None, arg(help="picture (PNG) of means with intervals")] = None,
+    device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
+) -> None:
+    """Score trackers on the Lite benchmark; prints Markdown tables with 95 % bootstrap intervals over clips."""
+    from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, summary_table
+    from tapip3d_lite.leaderboard import score_trackers
+
+    splits = split or SPLITS
+    results = score_trackers(tracker, splits, space, count, out, device)
+    for part in ("", "_dynamic", "_static"):
+        print(summary_table(results, tuple(metric + part for metric in METRICS), splits) + "\n")
+    if figure:
+        from tapip3d_lite.ui.scores import score_figure
+
+        t3d.figures.save_png(score_figure(results, splits=splits), figure)
+        print(f"wrote {figure}")
+
+
 def demo(
     clip: Positional[Path] = Path("data_samples/arc.npz"),
     /,
@@ -132,6 +156,7 @@ def picture(
 COMMANDS = {
     "track": track,
     "evaluate": evaluate,
+    "benchmark": benchmark,
     "demo": demo,
     "check": check,
     "simulate": simulate,
