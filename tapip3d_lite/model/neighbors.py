@@ -53,7 +53,13 @@ class Neighbors:
 
 
 class KNearest(nn.Module):
-    """The K cells nearest in 3D, nearest first."""
+    """The K cells nearest in 3D, nearest first.
+
+    Attributes:
+        fast: search trees where that is sooner than comparing with every cell; the result is the same.
+    """
+
+    fast: bool = True
 
     def __init__(self, config: TrackerConfig) -> None:
         super().__init__()
@@ -80,7 +86,7 @@ class KNearest(nn.Module):
 
     def _search(self, level: Level, queries: Tensor, points: Tensor) -> Tensor:
         valid = level.valid.flatten(0, 1) if self.exclude_invalid else None
-        if queries.shape[:2].numel() * points.shape[1] > _FEW:
+        if self.fast and queries.shape[:2].numel() * points.shape[1] > _FEW:
             if "tree" not in level.memory:
                 level.memory["tree"] = BlockTree.build(level.points.flatten(0, 1), valid)
             if level.memory["tree"] is not None:

@@ -40,7 +40,8 @@ class Tracker(nn.Module):
     """Tracks any points of a posed RGB-D video in 3D.
 
     Attributes:
-        fast: compute N2N by `fast.Ready`, which gives the same numbers as the clear form in `contexts` sooner.
+        fast: compute N2N by `fast.Ready`, which gives the same numbers as the clear form in `contexts` sooner, in
+            pieces that fit a CPU's cache.
     """
 
     fast: bool = True
@@ -203,7 +204,7 @@ class Tracker(nn.Module):
         """
         count, config = coords.shape[2], self.config
         floats = coords.shape[0] * coords.shape[1] * config.neighbors * config.token_dim * 4
-        budget = min(_CHUNK, _CPU_CHUNK) if coords.device.type == "cpu" else _CHUNK
+        budget = min(_CHUNK, _CPU_CHUNK) if self.fast and coords.device.type == "cpu" else _CHUNK
         step = count if torch.is_grad_enabled() else max(1, budget // floats)
         ready, chunks = self._ready(window), []
         for rows in (slice(i, i + step) for i in range(0, count, step)):

@@ -1,0 +1,143 @@
+"""The bench: measuring itself, each part on tiny sizes, its table, figure and command."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import tapip3d_lite as t3d
+from tapip3d_lite.evaluation import bench
+from tapip3d_lite.evaluation.timing import extra_memory, ratios, side_by_side, stages
+from tapip3d_lite.ui.speed import speed
+
+LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory is read from /proc")
+
+
+def test_ways_take_turns():
+    order = []
+    runs = {name: lambda name=name: (order.append(name), time.sleep(0.01 if name == "a" else 0.03)) for name in "ab"}
+    seconds = side_by_side(runs, rounds=2)
+    assert order == ["a", "b"] * 3
+    assert all(0.01 <= x < 0.03 for x in seconds["a"]) and all(x >= 0.03 for x in seconds["b"])
+    assert ratios([2.0, 6.0, 3.0], [1.0, 1.0, 1.0]) == (2.0, 3.0, 6.0)
+
+
+def test_stages_add_up_and_leave_no_hooks():
+    class Slow(nn.Module):
+        def forward(self, x):
+            time.sleep(0.02)
+            return x
+
+    first, second = Slow(), Slow()
+    with stages({"first": first, "second": second}) as spent:
+        second(first(second(0)))
+    assert 0.02 <= spent["first"] < 0.04 <= spent["second"] < 0.08
+    assert not first._forward_hooks and not first._forward_pre_hooks
+
+
+def allocate(mib):
+    return lambda: np.ones(mib * 2**20 // 8)
+
+
+def fail():
+    raise SystemExit(1)
+
+
+@LINUX
+def test_extra_memory_is_what_a_run_allocates():
+    assert 63 < extra_memory(allocate, 64) < 80
+    with pytest.raises(RuntimeError, match="fail"):
+        extra_memory(fail)
+
+
+def test_straightforward_is_the_clear_form():
+    clear, fast = (bench.make_tracker(fast=x) for x in (False, True))
+    assert not (clear.fast or clear.neighborhood.fast) and fast.fast and fast.neighborhood.fast
+    for a, b in zip(clear.parameters(), fast.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return list(bench.bench(["knn", "training", "gpu"], quick=True, rounds=1))
+
+
+def test_rows_tell_ways_cases_and_ratios(rows):
+    knn = [row for row in rows if row.part == "k-NN"]
+    assert {"maps 48x64", "maps 24x32", "all maps"} == {row.case for row in knn}
+    assert {"cdist + topk", "brute force", "trees of boxes"} <= {row.way for row in knn}
+    for case in {row.case for row in knn}:
+        here = [row for row in knn if row.case == case]
+        assert here[0].faster is None and all(row.than == here[0].way for row in here[1:])
+        for row in here[1:]:
+            assert row.faster[1] == pytest.approx(here[0].seconds[0] / row.seconds[0])
+    text = bench.table(rows)
+    assert text.count("\n") >= len(rows) + 1 and "straightforward" in text
+    if not torch.cuda.is_available():
+        assert "skipped: torch sees no CUDA device" in text
+
+
+def test_without_scipy_the_row_is_missing_and_said_so(monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy.spatial", None)
+    rows = list(bench.bench(["knn"], quick=True, rounds=1))
+    assert not any(row.way == "cKDTree" for row in rows)
+    assert "SciPy is not installed" in bench.table(rows)
+
+
+def test_model_rows_have_stages_equal_numbers_and_memory():
+    rows = list(bench.bench_model(quick=True, rounds=1))
+    whole = {row.way: row for row in rows if ":" not in row.case}
+    assert whole["fast"].values["largest difference"] < 1e-3
+    assert whole["fast, bf16"].values["median difference"] > 0
+    for way, row in whole.items():
+        parts = sum(r.seconds[0] for r in rows if ":" in r.case and r.way == way)
+        assert parts == pytest.approx(row.seconds[0], rel=0.05)
+    if sys.platform.startswith("linux"):
+        assert all(row.values["MiB"] > 1 for row in whole.values())
+    assert speed(rows).axes[0].patches
+
+
+def test_memory_and_scaling_parts(monkeypatch):
+    monkeypatch.setattr(bench, "extra_memory", lambda prepare, *a: float(prepare(*a)() is not None))
+    from tapip3d_lite.model import inference
+
+    monkeypatch.setattr(inference, "_KEPT", inference._KEPT)  # restored afterwards
+    rows = list(bench.bench_memory(quick=True))
+    assert [row.values["frames"] for row in rows] == [8, 8, 16, 16] and len(speed(rows).axes[1].lines) == 2
+    assert {row.way for row in bench.bench_scaling(quick=True, rounds=1)} >= {"N = 16", "T = 8", "K = 4", "side = 128"}
+
+
+def test_the_gpu_part_runs_on_any_device():
+    rows = list(bench.bench_gpu(quick=True, rounds=1, device="cpu"))
+    assert [row.way for row in rows] == ["fast", "fast, bf16"]
+    assert all(row.values["FPS"] == pytest.approx(8 / row.seconds[0]) for row in rows)
+
+
+def test_command_writes_every_measurement(tmp_path):
+    out, figure = tmp_path / "bench.json", tmp_path / "bench.png"
+    command = [sys.executable, "-W", "error", "-m", "tapip3d_lite", "bench"]
+    options = ["--quick", "--rounds", "2", "--threads", "1"]
+    root = Path(t3d.__path__[0]).parent
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    result = subprocess.run(
+        [*command, "knn", *options, "--out", str(out), "--figure", str(figure)],
+        capture_output=True, text=True, cwd=tmp_path, env=environment, check=True,
+    )  # fmt: skip
+    assert result.stdout.startswith("| part | case |")
+    stored = json.loads(out.read_text())
+    assert all(len(row["seconds"]) == 2 for row in stored) and figure.stat().st_size > 5000
+    wrong = subprocess.run([*command, "speed"], capture_output=True, text=True, env=environment)
+    assert wrong.returncode == 2 and "expected parts among model, knn" in wrong.stderr
+
+
+@pytest.mark.parametrize("options", [{"parts": ["speed"]}, {"rounds": 0}])
+def test_bad_options(options):
+    with pytest.raises(ValueError, match="rounds >= 1"):
+        list(bench.bench(**options))
