@@ -153,6 +153,49 @@ def picture(
     print(f"wrote {out}")
 
 
+def bench(
+    parts: Positional[Annotated[tuple[str, ...], arg(help="model knn training scaling gpu memory; default: all")]] = (),
+    /,
+    quick: Annotated[bool, arg(help="small sizes, about a minute")] = False,
+    rounds: Annotated[int | None, arg(help="how often each way is measured")] = None,
+    threads: Annotated[int | None, arg(help="of torch; default: its own choice")] = None,
+    out: Annotated[Path | None, arg(help="JSON with every measurement")] = None,
+    figure: Annotated[Path | None, arg(help="picture (PNG) of stages and memory")] = None,
+) -> None:
+    """Measure speed and memory against straightforward forms; prints a Markdown table."""
+    import json
+    from dataclasses import asdict
+
+    import torch
+
+    from tapip3d_lite.evaluation import bench as measure
+    from tapip3d_lite.files import atomic_path
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    rows = list(measure.bench(parts or tuple(measure.PARTS), quick, rounds))
+    print(measure.table(rows))
+    if out:
+        with atomic_path(out) as temporary:
+            temporary.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
+        print(f"wrote {out}")
+    if figure:
+        from tapip3d_lite.ui.speed import speed
+
+        t3d.figures.save_png(speed(rows), figure)
+        print(f"wrote {figure}")
+
+
+def formulas(out: Path = Path("notebooks/FORMULAS.md")) -> None:
+    """Write the table "formula → symbol → tensor → shape → file:line" from the code."""
+    from tapip3d_lite.files import atomic_path
+    from tapip3d_lite.ui.formulas import formula_table
+
+    with atomic_path(out) as temporary:
+        temporary.write_text(formula_table(), encoding="utf-8")
+    print(f"wrote {out}")
+
+
 COMMANDS = {
     "track": track,
     "evaluate": evaluate,
@@ -163,6 +206,7 @@ COMMANDS = {
     "samples": samples,
     "import": import_,
     "picture": picture,
+    "bench": bench,
 }
 
 
