@@ -196,6 +196,16 @@ def formulas(out: Path = Path("notebooks/FORMULAS.md")) -> None:
     print(f"wrote {out}")
 
 
+def formulas(out: Path = Path("notebooks/FORMULAS.md")) -> None:
+    """Write the table "formula → symbol → tensor → shape → file:line" from the code."""
+    from tapip3d_lite.files import atomic_path
+    from tapip3d_lite.ui.formulas import formula_table
+
+    with atomic_path(out) as temporary:
+        temporary.write_text(formula_table(), encoding="utf-8")
+    print(f"wrote {out}")
+
+
 COMMANDS = {
     "track": track,
     "evaluate": evaluate,
@@ -207,6 +217,7 @@ COMMANDS = {
     "import": import_,
     "picture": picture,
     "bench": bench,
+    "formulas": formulas,
 }
 
 
