@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker
 from tapip3d_lite.evaluation.benchmark import SPLITS, Results, load_results, run_benchmark, save_results, version_of
-from tapip3d_lite.trackers import _BASELINES, _WEIGHTS, load_tracker
+from tapip3d_lite.trackers import TrackerLike, load_tracker
 
 
 def score_trackers(
@@ -41,8 +42,8 @@ def score_trackers(
     labels = []
     for name in trackers:
         tracker = load_tracker(name, device=device)
-        for label, options, made_with in _runs(name, tracker, spaces):
-            version = version_of(made_with, options)
+        for label, options in _runs(name, tracker, spaces):
+            version = version_of(tracker, options)
             if versions.get(label) != version:
                 results[label], versions[label] = {}, version
             save = partial(_save, out, results, versions) if out else None
@@ -51,13 +52,11 @@ def score_trackers(
     return {label: results[label] for label in dict.fromkeys(labels)}
 
 
-def _runs(name: str | Path, tracker: object, spaces: Sequence[str]) -> list[tuple[str, dict, object]]:
-    """(label, options of `track`, what decides the scores) of each run of a tracker."""
-    if str(name) in _BASELINES:
-        return [(str(name), {}, tracker)]
-    shipped = _WEIGHTS / f"{name}.safetensors"
-    path = shipped if shipped.exists() else Path(name)
-    return [(f"{path.stem} · {space}", {"space": space}, path) for space in spaces]
+def _runs(name: str | Path, tracker: TrackerLike, spaces: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+    """(label, options of `track`) of each run of a tracker."""
+    if isinstance(tracker, StaticTracker | KltTracker):
+        return [(str(name), {})]
+    return [(f"{Path(name).with_suffix('')} · {space}", {"space": space}) for space in spaces]
 
 
 def _save(out: str | Path, results: Results, versions: dict[str, str | None], _: object) -> None:

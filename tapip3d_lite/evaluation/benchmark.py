@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, Protocol
 
 from tqdm import tqdm
 
@@ -38,10 +39,11 @@ Results = dict[str, SplitScores]  # label → …
 METRICS = ("AJ3D_none", "APD3D_none", "AJ3D", "APD3D", "OA")
 
 
-class Trackable:
-    """Whatever has `track(clip, queries=None, **options) -> Tracks`."""
+class Trackable(Protocol):
+    """Whatever can be scored."""
 
-    track: Callable[..., Tracks]
+    def track(self, clip: Clip, **options: Any) -> Tracks:
+        """Tracks of the clip's own queries, in their order."""
 
 
 def run_benchmark(
@@ -94,13 +96,15 @@ def _score(tracker: Trackable, clip: Clip, options: Mapping[str, object]) -> dic
     return evaluate(tracker.track(clip, **options), clip)
 
 
-def version_of(*parts: object) -> str:
-    """A short digest of the benchmark's clips and of what else decides scores, such as a weights file and options."""
+def version_of(tracker: object, options: Mapping[str, object]) -> str:
+    """A short digest of what decides scores: the benchmark's clips, a tracker's settings and weights, options."""
     digest = hashlib.sha256()
     for split in SPLITS:
         digest.update((FOLDER / f"{split}.npz").read_bytes())
-    for part in parts:
-        digest.update(part.read_bytes() if isinstance(part, Path) else repr(part).encode())
+    digest.update(f"{getattr(tracker, 'config', tracker)!r} {sorted(options.items())}".encode())
+    if hasattr(tracker, "state_dict"):
+        for name, weights in tracker.state_dict().items():
+            digest.update(name.encode() + weights.cpu().float().contiguous().numpy().tobytes())
     return digest.hexdigest()[:12]
 
 
