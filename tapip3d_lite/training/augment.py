@@ -25,7 +25,7 @@ class AugmentConfig:
             saturation, hue).
         blur: share of the clips with blurred colours, standard deviations within `blur_sigma`.
         depth_blur: share with blurred depth, within `depth_blur_sigma` (the paper names no strength; ours
-            smears an edge over about a pixel at a width of 128).
+            is less than a pixel at a width of 128).
         reframe: share that is padded (each side by at most `pad`), resized (by a factor within `scale`) and cropped
             to the old size at a place that wanders by at most `drift` a frame.
         flip_x, flip_y, flip_time: shares that are mirrored, and played backward.
@@ -42,7 +42,7 @@ class AugmentConfig:
     blur: float = 0.25
     blur_sigma: tuple[float, float] = (0.1 / 512, 2 / 512)
     depth_blur: float = 0.5
-    depth_blur_sigma: tuple[float, float] = (1 / 512, 4 / 512)
+    depth_blur_sigma: tuple[float, float] = (0.5 / 512, 3 / 512)
     reframe: float = 1.0
     pad: float = 25 / 512
     scale: tuple[float, float] = (0.75, 1.25)
@@ -55,6 +55,8 @@ class AugmentConfig:
         for name in ("erase", "jitter", "blur", "depth_blur", "reframe", "flip_x", "flip_y", "flip_time"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"AugmentConfig.{name}: expected a share in [0, 1], got {getattr(self, name)}")
+        for name in ("erase_side", "blur_sigma", "depth_blur_sigma", "scale", "jitter_strength"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # lists come from JSON
         for name in ("erase_side", "blur_sigma", "depth_blur_sigma", "scale"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
