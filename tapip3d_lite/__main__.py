@@ -206,6 +206,17 @@ def formulas(out: Path = Path("notebooks/FORMULAS.md")) -> None:
     print(f"wrote {out}")
 
 
+def teach(
+    out: Annotated[Path, arg(help="the pack's folder")],
+    notebooks: Annotated[Path, arg(help="folder of the notebooks")] = Path("notebooks"),
+    lesson: Annotated[int, arg(help="minutes of a lesson")] = 45,
+) -> None:
+    """Write a teacher's pack: student and solution versions of all notebooks, and a timing plan."""
+    from tapip3d_lite.ui.teaching import write_pack
+
+    print(f"wrote {len(write_pack(notebooks, out, lesson))} files to {out}; begin with {out / 'TIMING.md'}")
+
+
 COMMANDS = {
     "track": track,
     "evaluate": evaluate,
@@ -218,6 +229,7 @@ COMMANDS = {
     "picture": picture,
     "bench": bench,
     "formulas": formulas,
+    "teach": teach,
 }
 
 

@@ -1,7 +1,6 @@
-"""Run notebooks, store clean outputs, fill in solutions: `python -m tests.notebook_tools [name …]`."""
+"""Run notebooks, store clean outputs: `python -m tests.notebook_tools [name …]`."""
 
 import argparse
-import copy
 import re
 import sys
 import time
@@ -14,16 +13,11 @@ from tapip3d_lite.files import atomic_path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "notebooks"
-SOLUTION = re.compile(r"<details>\s*<summary>Solution</summary>\s*```python\n(.*?)```", re.DOTALL)
 _PATHS = re.compile(r"(?:/[\w.\-]+)*/(?:notebooks|data_samples|tapip3d_lite)(?=/|\b)")
 
 
 def notebooks():
     return sorted(FOLDER.glob("[0-9][0-9]_*.ipynb"))
-
-
-def tags(cell):
-    return cell.metadata.get("tags", [])
 
 
 def run(nb, folder=FOLDER, timeout=300):
@@ -58,26 +52,6 @@ def clean(nb):
             if "metadata" in output:  # a stream has none
                 output.metadata = {}
     return nb
-
-
-def solution_copy(nb):
-    """A copy in which every exercise's stub is replaced by the folded solution that follows it."""
-    filled = copy.deepcopy(nb)
-    for i, cell in enumerate(filled.cells):
-        if "exercise" in tags(cell):
-            cell.source = solution_of(filled, i)
-    return filled
-
-
-def solution_of(nb, index):
-    """The code of the first folded solution after the stub at `index`, before the next stub."""
-    for cell in nb.cells[index + 1 :]:
-        if "exercise" in tags(cell):
-            break
-        found = SOLUTION.search(cell.source) if cell.cell_type == "markdown" else None
-        if found:
-            return found.group(1).rstrip()
-    raise ValueError(f"no folded solution after the stub:\n{nb.cells[index].source}")
 
 
 def save(nb, path):

@@ -6,7 +6,8 @@ import re
 import nbformat
 import pytest
 
-from tests.notebook_tools import ROOT, clean, notebooks, run, solution_copy, solution_of, tags
+from tapip3d_lite.ui.teaching import solution_copy, solution_of, tags
+from tests.notebook_tools import ROOT, clean, notebooks, run
 
 NOTEBOOKS = notebooks()
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)

@@ -1,0 +1,181 @@
+"""The teacher's pack: every notebook once for students and once solved, and a timing plan, from the notebooks alone.
+
+A stub is a code cell tagged `exercise`. Its solution is folded into a later text cell, its title, difficulty and minutes
+stand in the cell before it. Notebooks are plain dictionaries as in their JSON; `nbformat`'s do as well.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tapip3d_lite.files import atomic_path
+
+Notebook = dict[str, Any]
+
+_CODE = re.compile(r"<details>\s*<summary>Solution</summary>\s*```python\n(.*?)```", re.DOTALL)
+_FOLD = re.compile(r"\s*<details>\s*<summary>Solution</summary>.*?</details>", re.DOTALL)
+_TITLE = re.compile(r"^#+ Exercise\s*([\d.]*)\s*[:·]\s*(.+)$", re.MULTILINE)
+_MINUTES = re.compile(r"(\d+)\s*min")
+_LINK = re.compile(r"\[([^\]]*)\]\(\.\./tapip3d_lite[^)]*\)")
+
+
+@dataclass(frozen=True)
+class Task:
+    """An exercise as it stands in the plan: number (may be empty), title, stars, minutes."""
+
+    number: str
+    title: str
+    stars: str
+    minutes: int
+
+
+def read_notebook(path: str | Path) -> Notebook:
+    """A notebook as a dictionary, each cell's source one string.
+
+    Raises:
+        ValueError: no such file, or not a notebook.
+    """
+    try:
+        nb = json.loads(Path(path).read_text(encoding="utf-8"))
+        for cell in nb["cells"]:
+            cell["source"] = "".join(cell["source"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a readable notebook ({error})") from None
+    return nb
+
+
+def tags(cell: dict[str, Any]) -> list[str]:
+    """A cell's tags."""
+    return cell["metadata"].get("tags", [])
+
+
+def stubs(nb: Notebook) -> list[int]:
+    """Indices of the cells that a student fills in."""
+    return [i for i, cell in enumerate(nb["cells"]) if "exercise" in tags(cell)]
+
+
+def solution_of(nb: Notebook, index: int) -> str:
+    """The code of the first folded solution after the stub at `index`, before the next stub; ValueError without one."""
+    for cell in nb["cells"][index + 1 :]:
+        if "exercise" in tags(cell):
+            break
+        found = _CODE.search(cell["source"]) if cell["cell_type"] == "markdown" else None
+        if found:
+            return found.group(1).rstrip()
+    raise ValueError(f"no folded solution after the stub:\n{nb['cells'][index]['source']}")
+
+
+def solution_copy(nb: Notebook) -> Notebook:
+    """A copy in which every stub is replaced by the folded solution that follows it."""
+    filled = copy.deepcopy(nb)
+    for i in stubs(nb):
+        filled["cells"][i]["source"] = solution_of(nb, i)
+    return filled
+
+
+def handout(nb: Notebook) -> Notebook:
+    """A copy without outputs and without folded solutions; hints stay."""
+    bare = copy.deepcopy(nb)
+    for cell in bare["cells"]:
+        if cell["cell_type"] == "code":
+            cell["outputs"], cell["execution_count"] = [], None
+        elif cell["cell_type"] == "markdown":
+            cell["source"] = _FOLD.sub("", cell["source"])
+    bare["cells"] = [cell for cell in bare["cells"] if cell["source"].strip()]
+    return bare
+
+
+def tasks(nb: Notebook) -> list[Task]:
+    """The exercises of a notebook with their minutes; ValueError where the cell before a stub does not tell them."""
+    found = []
+    for i in stubs(nb):
+        before = nb["cells"][i - 1]["source"] if i else ""
+        titles, facts = list(_TITLE.finditer(before)), re.search(r"(★+)\D*(\d+) min", before)
+        if not titles or not facts:
+            raise ValueError(
+                f"expected 'Exercise … · title' and 'Difficulty ★ · 5 min' before the stub, got:\n{before[-300:]}"
+            )
+        found.append(Task(titles[-1][1], titles[-1][2].strip(), facts[1], int(facts[2])))
+    return found
+
+
+def minutes(nb: Notebook) -> int:
+    """Minutes for reading and solving a notebook, from the line of its opening that tells them; ValueError without."""
+    opening = "\n".join(cell["source"] for cell in nb["cells"][:3] if cell["cell_type"] == "markdown")
+    found = [
+        (not re.search("read", line, re.IGNORECASE), m[1])
+        for line in opening.splitlines()
+        if (m := _MINUTES.search(line))
+    ]
+    if not found:
+        raise ValueError(
+            f"expected the opening to tell its minutes, e.g. 'Reading and exercises: 40 minutes', got:\n{opening[:300]}"
+        )
+    return int(min(found, key=lambda pair: pair[0])[1])  # else the first one
+
+
+def timing_plan(notebooks: dict[str, Notebook], lesson: int = 45) -> str:
+    """One page in Markdown: minutes of every notebook and exercise.
+
+    Args:
+        notebooks: name to notebook, in the order of the course.
+        lesson: minutes of one lesson.
+    """
+    lines = [
+        "# Timing plan",
+        "",
+        f"Minutes as the notebooks tell them; a lesson has {lesson}. Together: what is shown and talked through in class.",
+        "",
+        "| notebook | minutes | lessons | together | exercises: title, difficulty, minutes |",
+        "|---|---|---|---|---|",
+    ]
+    total = together = 0
+    for name, nb in notebooks.items():
+        whole, todo = minutes(nb), tasks(nb)
+        rest = whole - sum(task.minutes for task in todo)
+        if rest < 0:
+            raise ValueError(f"{name}: its exercises take {whole - rest} minutes, more than the {whole} of the opening")
+        told = " · ".join(f"{' '.join(filter(None, (t.number, t.title)))} {t.stars} {t.minutes}" for t in todo)
+        lines.append(f"| {name} | {whole} | {-(-whole // lesson)} | {rest} | {told} |")
+        total, together = total + whole, together + rest
+    lines.append(f"| all | {total} | {-(-total // lesson)} | {together} | {total - together} minutes |")
+    return "\n".join(lines) + "\n"
+
+
+def write_pack(notebooks: Path, out: Path, lesson: int = 45) -> list[Path]:
+    """Write the pack: `student/` and `solution/` notebooks, `TIMING.md`, and the clips that they load.
+
+    Args:
+        notebooks: folder of the numbered notebooks; `data_samples` lies beside it.
+        out: the pack's folder.
+        lesson: minutes of one lesson.
+
+    Returns:
+        The notebooks and the plan that were written.
+
+    Raises:
+        ValueError: no notebooks there, or one whose exercises are not whole.
+    """
+    course = {path.stem: read_notebook(path) for path in sorted(notebooks.glob("[0-9][0-9]_*.ipynb"))}
+    if not course:
+        raise ValueError(f"{notebooks}: no notebooks named 00_….ipynb there; name their folder with --notebooks")
+    files = {out / "TIMING.md": timing_plan(course, lesson)}
+    for name, nb in course.items():
+        for folder, version in (("student", nb), ("solution", solution_copy(nb))):
+            files[out / folder / f"{name}.ipynb"] = json.dumps(handout(version), indent=1, ensure_ascii=False) + "\n"
+    for page in sorted(notebooks.glob("*.md")):
+        text = _LINK.sub(r"\1", page.read_text(encoding="utf-8"))  # the code does not lie beside the pack
+        files |= {out / folder / page.name: text for folder in ("student", "solution")}
+    for path, text in files.items():
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    samples = notebooks.parent / "data_samples"
+    if samples.is_dir():
+        shutil.copytree(samples, out / "data_samples", dirs_exist_ok=True)
+    return list(files)
