@@ -13,6 +13,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 import tapip3d_lite as t3d
+from tapip3d_lite.training.config import TrainConfig
 
 
 def track(
@@ -127,6 +128,27 @@ def simulate(
     simulate_dataset(out, count, config, first_seed=first_seed, workers=workers)
 
 
+def train(
+    out: Annotated[Path, arg(help="the training's folder")],
+    config: Annotated[TrainConfig, arg(name="")],
+    data: Annotated[
+        Path | None, arg(help="folder of the clips, shared by trainings; missing ones are simulated")
+    ] = None,
+    resume: Annotated[bool, arg(help="continue from the folder's checkpoint, with its recipe")] = False,
+    device: Annotated[str, arg(help="cpu or cuda; several processes: torchrun -m tapip3d_lite train …")] = "cpu",
+) -> None:
+    """Train a tracker on simulated clips; Ctrl-C saves and stops, --resume goes on exactly there."""
+    from tapip3d_lite.training.command import train as run
+
+    try:
+        finished, text = run(out, config, data, resume, device)
+    except FloatingPointError as error:
+        raise ValueError(str(error)) from error
+    print(text)
+    if not finished:
+        sys.exit(130)
+
+
 def samples(out: Path = Path("data_samples")) -> None:
     """Regenerate the sample clips and their table from seeds."""
     from tapip3d_lite.simulate.samples import write_samples
@@ -196,16 +218,6 @@ def formulas(out: Path = Path("notebooks/FORMULAS.md")) -> None:
     print(f"wrote {out}")
 
 
-def formulas(out: Path = Path("notebooks/FORMULAS.md")) -> None:
-    """Write the table "formula → symbol → tensor → shape → file:line" from the code."""
-    from tapip3d_lite.files import atomic_path
-    from tapip3d_lite.ui.formulas import formula_table
-
-    with atomic_path(out) as temporary:
-        temporary.write_text(formula_table(), encoding="utf-8")
-    print(f"wrote {out}")
-
-
 def teach(
     out: Annotated[Path, arg(help="the pack's folder")],
     notebooks: Annotated[Path, arg(help="folder of the notebooks")] = Path("notebooks"),
@@ -225,6 +237,7 @@ COMMANDS = {
     "check": check,
     "simulate": simulate,
     "samples": samples,
+    "train": train,
     "import": import_,
     "picture": picture,
     "bench": bench,

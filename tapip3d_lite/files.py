@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -33,15 +33,15 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def load_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz file; a missing, truncated, pickled or foreign file is a ValueError."""
+def load_npz(path: str | Path, skip: Collection[str] = ()) -> dict[str, np.ndarray]:
+    """The arrays of an npz file, apart from those to skip; a missing, truncated, pickled or foreign file is a ValueError."""
     try:
         # An open file of our own: np.load leaks the one it opens when the zip turns out to be broken.
         with open(path, "rb") as file:
             data = np.load(file, allow_pickle=False)
             if not isinstance(data, np.lib.npyio.NpzFile):
                 raise ValueError("it holds one bare array, not named ones")
-            return {key: data[key] for key in data.files}
+            return {key: data[key] for key in data.files if key not in skip}
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; check the path") from None
     except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError, NotImplementedError) as error:

@@ -26,7 +26,7 @@ class TrackerLike(Protocol):
         support_grid: int = 16,
         bidirectional: bool = True,
         depth_roi: str | tuple[float, float] | None = "auto",
-        visible_threshold: float = 0.9,
+        visible_threshold: float | None = None,
         progress: bool = False,
     ) -> Tracks:
         """3D tracks of `queries` (N, 4), of the clip's own queries, or of a grid on the first frame."""

@@ -77,6 +77,7 @@ class TrackerConfig:
         separate_vis_head: an own linear layer for visibility and (unused) confidence.
         outputs: 4 = (dx, dy, dz, dvis), or 5 with the unused confidence.
         iterations: M, updates of a window when the caller names no number.
+        visible_threshold: probability from which a point counts as visible when the caller names none.
 
     Raises:
         ValueError: a value or combination that cannot work, and why.
@@ -116,6 +117,7 @@ class TrackerConfig:
     separate_vis_head: bool = True
     outputs: int = 5
     iterations: int = 6
+    visible_threshold: float = 0.9
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image_size", tuple(int(side) for side in self.image_size))
@@ -185,6 +187,8 @@ class TrackerConfig:
             raise ValueError(
                 f"TrackerConfig.space_depth: must divide time_depth = {self.time_depth}, got {self.space_depth}"
             )
+        if not 0 <= self.visible_threshold <= 1:
+            raise ValueError(f"TrackerConfig.visible_threshold: expected a probability, got {self.visible_threshold}")
         if self.outputs not in (4, 5) or (self.separate_vis_head and self.outputs != 5):
             raise ValueError(f"TrackerConfig.outputs: expected 4, or 5 with a confidence, got {self.outputs}")
 
@@ -224,7 +228,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "window": 8,
         "feature_dim": 64,
         "levels": 3,
-        "neighbors": 12,
+        "neighbors": 9,
         "token_dim": 64,
         "context_head_dim": 64,
         "offset_layers": 2,

@@ -33,7 +33,7 @@ def track(
     support_grid: int = 16,
     bidirectional: bool = True,
     depth_roi: str | tuple[float, float] | None = "auto",
-    visible_threshold: float = 0.9,
+    visible_threshold: float | None = None,
     progress: bool = False,
 ) -> Tracks:
     """Track points through a clip.
@@ -52,7 +52,7 @@ def track(
         bidirectional: also track backward from queries after the first frame; otherwise frames before a query hold
             whatever the first window that contains it says.
         depth_roi: depths (near, far) that count for the scale; `"auto"`: up to q75 + 1.5 IQR of the clip; None: all.
-        visible_threshold: a point counts as visible from this probability on.
+        visible_threshold: a point counts as visible from this probability on; the config's if None.
         progress: show a bar.
 
     Returns:
@@ -61,7 +61,7 @@ def track(
     Raises:
         ValueError: queries outside the clip, a space that the model was not made for, or a bad option.
     """
-    check_options(tracker, space, depth_roi, visible_threshold, support_grid)
+    threshold = check_options(tracker, space, depth_roi, visible_threshold, support_grid)
     queries = resolve_queries(clip, queries)
     clip = resize_clip(clip, tracker.config.image_size)
     roi = quantile_roi(torch.from_numpy(clip.depths)) if isinstance(depth_roi, str) else depth_roi
@@ -77,7 +77,7 @@ def track(
             before = np.arange(len(clip))[:, None] < queries[:, 0]
             xyz = np.where(before[..., None], other[0][::-1], xyz)
             logits = np.where(before, other[1][::-1], logits)
-    visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= visible_threshold
+    visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= threshold
     return Tracks(xyz, visible, queries, logits)
 
 
@@ -139,8 +139,8 @@ def _bar(show: bool, tracker: nn.Module, frames: int, iterations: int | None, pa
     return tqdm(total=total, disable=not show, desc="tracking")
 
 
-def check_options(tracker: nn.Module, space: Any, roi: Any, threshold: float, grid: int) -> None:
-    """ValueError where an option of `track` cannot be honoured."""
+def check_options(tracker: nn.Module, space: Any, roi: Any, threshold: float | None, grid: int) -> float:
+    """The threshold of visibility; ValueError where an option of `track` cannot be honoured."""
     own = tracker.config.space
     if space not in (None, own) and not (own in _INTERCHANGEABLE and space in _INTERCHANGEABLE):
         raise ValueError(
@@ -148,7 +148,9 @@ def check_options(tracker: nn.Module, space: Any, roi: Any, threshold: float, gr
         )
     if isinstance(roi, str) and roi != "auto":
         raise ValueError(f'depth_roi: expected "auto", None or (near, far), got {roi!r}')
+    threshold = tracker.config.visible_threshold if threshold is None else threshold
     if not 0 <= threshold <= 1:
         raise ValueError(f"visible_threshold: expected a probability in [0, 1], got {threshold}")
     if grid < 0:
         raise ValueError(f"support_grid: expected 0 or more, got {grid}")
+    return threshold

@@ -35,7 +35,7 @@ class Stream:
         iterations: M, the config's if None.
         support_grid: side of a grid of extra queries on the first frame that are tracked along and never told.
         depth_roi: depths (near, far) that count for the scale; None: all. It cannot be found from the whole clip here.
-        visible_threshold: probability from which a point counts as visible.
+        visible_threshold: probability from which a point counts as visible; the config's if None.
 
     Raises:
         ValueError: queries that are no (N, 4) rows with whole frame numbers, or a bad option.
@@ -49,9 +49,9 @@ class Stream:
         iterations: int | None = None,
         support_grid: int = 0,
         depth_roi: tuple[float, float] | None = None,
-        visible_threshold: float = 0.9,
+        visible_threshold: float | None = None,
     ) -> None:
-        inference.check_options(tracker, space, depth_roi, visible_threshold, support_grid)
+        threshold = inference.check_options(tracker, space, depth_roi, visible_threshold, support_grid)
         if isinstance(depth_roi, str):
             raise ValueError(
                 f"depth_roi: a stream does not know the whole clip's depths, so {depth_roi!r} cannot work; give (near, far) or None"
@@ -60,7 +60,7 @@ class Stream:
             raise ValueError(f"iterations: expected at least 1, got {iterations}")
         self.tracker, self.space, self.roi = tracker, make_space(space or tracker.space), depth_roi
         self.iterations = tracker.config.iterations if iterations is None else iterations
-        self.threshold, self.grid = visible_threshold, support_grid
+        self.threshold, self.grid = threshold, support_grid
         self.queries = _checked(queries)
         self._begin(self.queries)
         self.window: list[tuple[Frames, Tensor]] = []  # the last S frames with their features

@@ -71,14 +71,19 @@ _RECORDED = {
 }
 
 
-def save_weights(tracker: Tracker, path: str | Path) -> None:
+def save_weights(tracker: Tracker, path: str | Path, half: bool = False) -> None:
     """Write parameters and config as one safetensors file, atomically.
+
+    Args:
+        tracker: any.
+        path: of the file; missing folders are made.
+        half: store 16-bit floats, which halves the file; they are read back as 32-bit ones.
 
     Raises:
         ValueError: the tracker has a custom part, which no file can name.
     """
     config = json.dumps(tracker.config.to_dict())
-    state = {name: tensor.contiguous() for name, tensor in tracker.state_dict().items()}
+    state = {name: (x.half() if half else x).contiguous() for name, x in tracker.state_dict().items()}
     with atomic_path(path) as temporary:
         safetensors.torch.save_file(state, temporary, metadata={"format": _FORMAT, "config": config})
 

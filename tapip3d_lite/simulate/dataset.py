@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -15,12 +16,13 @@ from tapip3d_lite.simulate.config import SimulationConfig
 from tapip3d_lite.simulate.simulator import simulate_clip
 
 DESCRIPTION = "dataset.json"
+Recipe = Callable[[int], SimulationConfig]  # a seed's configuration; a function of a module, since workers import it
 
 
 def simulate_dataset(
     out: str | Path,
     count: int,
-    config: SimulationConfig | None = None,
+    config: SimulationConfig | Recipe | None = None,
     first_seed: int = 0,
     workers: int | None = None,
     progress: bool = True,
@@ -34,7 +36,7 @@ def simulate_dataset(
     Args:
         out: the folder; made if missing. Only one run may write to it at a time.
         count: number of clips.
-        config: what they contain; default values if None.
+        config: what they contain, or a function that tells it for each seed; default values if None.
         first_seed: non-negative.
         workers: processes; None for one per core.
         progress: show a bar.
@@ -66,39 +68,46 @@ def simulate_dataset(
     return [job[0] for job in jobs]
 
 
-def read_config(folder: str | Path) -> SimulationConfig:
-    """The configuration of a dataset folder.
-
-    Raises:
-        ValueError: there is no readable `dataset.json`.
-    """
-    path = Path(folder) / DESCRIPTION
-    try:
-        return SimulationConfig(**json.loads(path.read_text())["simulation"])
-    except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: not a readable dataset description ({error}); choose another folder") from error
-
-
-def _claim(folder: Path, config: SimulationConfig) -> None:
+def _claim(folder: Path, config: SimulationConfig | Recipe) -> None:
     """Make the folder ours: describe it, or check that its description is the same; drop half-written files."""
-    path = folder / DESCRIPTION
+    path, description = folder / DESCRIPTION, _describe(config)
     if path.exists():
-        stored, wanted = asdict(read_config(folder)), asdict(config)
-        different = [f"{k}={stored[k]!r} (now {wanted[k]!r})" for k in wanted if stored[k] != wanted[k]]
+        wanted = json.loads(json.dumps(description.get("simulation", description)))
+        stored = _read(path)
+        different = [
+            f"{k}={stored.get(k)!r} (now {wanted.get(k)!r})" for k in stored | wanted if stored.get(k) != wanted.get(k)
+        ]
         if different:
             raise ValueError(
-                f"simulate_dataset: {folder} holds clips of another configuration: {', '.join(different)}; "
+                f"simulate_dataset: {path} describes clips of another configuration: {', '.join(different)}; "
                 "use the same settings or another folder"
             )
     elif any(folder.glob("clip_*.npz")):
         raise ValueError(f"simulate_dataset: {folder} holds clips but no {DESCRIPTION}; choose another folder")
     else:
         with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps({"simulation": asdict(config)}, indent=2) + "\n")
+            temporary.write_text(json.dumps(description, indent=2) + "\n")
     for leftover in folder.glob(".clip_*.npz"):
         leftover.unlink()
 
 
-def _write(job: tuple[Path, int, SimulationConfig]) -> None:
+def _describe(config: SimulationConfig | Recipe) -> dict:
+    """What tells this configuration from others; of a recipe its name and its values for a few seeds."""
+    if isinstance(config, SimulationConfig):
+        return {"simulation": asdict(config)}
+    examples = {str(seed): asdict(config(seed)) for seed in range(4)}
+    return {"recipe": f"{config.__module__}.{config.__qualname__}", "examples": examples}
+
+
+def _read(path: Path) -> dict:
+    """The stored description, flat enough to name what differs."""
+    try:
+        stored = json.loads(path.read_text())
+        return dict(stored.get("simulation", stored))
+    except (OSError, AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: not a readable dataset description ({error}); choose another folder") from error
+
+
+def _write(job: tuple[Path, int, SimulationConfig | Recipe]) -> None:
     path, seed, config = job
-    simulate_clip(seed, config).save(path)
+    simulate_clip(seed, config if isinstance(config, SimulationConfig) else config(seed)).save(path)

@@ -7,18 +7,27 @@ image features are a leaf that collects their gradients, and the encoder is back
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from tapip3d_lite.model.frames import Frames
+from tapip3d_lite.model.scene import Step
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
 
 
 def saving_backward(
-    tracker: Tracker, frames: Frames, queries: Tensor, truth: Truth, config: LossConfig, **options: Any
+    tracker: Tracker,
+    frames: Frames,
+    queries: Tensor,
+    truth: Truth,
+    config: LossConfig,
+    features: Tensor | None = None,
+    watch: Callable[[Step], None] | None = None,
+    **options: Any,
 ) -> dict[str, float]:
     """Add the gradients of the whole loss to the parameters, one update at a time.
 
@@ -28,12 +37,14 @@ def saving_backward(
         queries: (B, N, 4) rows (t, x, y, z), world.
         truth: of the same tracks.
         config: weights of the loss.
+        features: (B, T, C, h, w) of an encoder that is not trained along; None: encode the frames.
+        watch: called with every update before it is forgotten.
         options: of `Tracker.steps`, e.g. `active`, `iterations`, `space`.
 
     Returns:
         `position` and `visibility`, the two parts of the loss, and their sum `loss`.
     """
-    features = tracker.encoder(frames.rgb)
+    features = tracker.encoder(frames.rgb) if features is None else features
     leaf = features.detach().requires_grad_(features.requires_grad)
     totals, iterations = [0.0, 0.0], options.get("iterations") or tracker.config.iterations
     for step in tracker.steps(frames, queries, features=leaf, **options):
@@ -42,6 +53,8 @@ def saving_backward(
         # update's own graph goes with the last reference to its results.
         sum(parts).backward(retain_graph=True)
         totals = [total + float(part.detach()) for total, part in zip(totals, parts, strict=True)]
+        if watch is not None:
+            watch(step)
         del step, parts
     if leaf.grad is not None:
         features.backward(leaf.grad)

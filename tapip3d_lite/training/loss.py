@@ -82,5 +82,9 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
     if config.form == "pixels":
         error = error * (frames.intrinsics[..., 0, 0] * frames.intrinsics[..., 1, 1]).sqrt()[..., None]
     entropy = F.binary_cross_entropy_with_logits(step.logits, visible.to(step.logits.dtype), reduction="none")
-    weight = config.scale * config.discount ** (iterations - 1 - step.iteration) / counted.sum().clamp(min=1)
-    return weight * (error * counted).sum(), weight * config.visibility * (entropy * counted).sum()
+    weight = config.scale * config.discount ** (iterations - 1 - step.iteration)
+    # A mean over each clip, then over clips: so the mean over processes is the mean over their joint batch.
+    position, visibility = (
+        ((x * counted).flatten(1).sum(1) / counted.flatten(1).sum(1).clamp(min=1)).mean() for x in (error, entropy)
+    )
+    return weight * position, weight * config.visibility * visibility

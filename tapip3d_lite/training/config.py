@@ -1,0 +1,105 @@
+"""`TrainConfig`: a whole training as one value; with the clips' seeds it determines the weights on one machine."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.training.loss import LossConfig
+from tapip3d_lite.training.matching import MatchingConfig
+from tapip3d_lite.training.motion import MotionConfig
+from tapip3d_lite.training.sampling import SamplingConfig
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """What is trained, on what, and how long. Defaults are the `lite` recipe for two CPU cores.
+
+    Attributes:
+        preset: of the tracker, `"lite"` or `"paper"`.
+        tracker: fields of the preset to set differently, e.g. `{"context": "p2n"}`.
+        clips: number of training clips.
+        matching_steps: steps that teach the encoder alone to match; 0 leaves it random.
+        steps: steps that train the tracker.
+        batch: clips a step (of each process).
+        frames: (first, last) frames of an example; `short` of the steps use the first number, the others the last.
+        short: share of the steps with short examples, which come first.
+        iterations: M while training; `iterations` of the tracker's config are used at test.
+        train_encoder: train the encoder along; otherwise its features are kept in files, and a step costs half.
+        lr, weight_decay, warmup, clip_norm: AdamW with one cosine cycle (the paper's: 5e-4, 5e-4, 0.05, 10).
+        precision: `"float32"`, or `"bfloat16"` for autocast.
+        head: standard deviation of the output layer's first weights.
+        seed: of everything that is drawn.
+        evaluate_every, validation: steps between evaluations, and on how many held-out clips.
+        save_every: steps between checkpoints.
+
+    Raises:
+        ValueError: a value that cannot work.
+    """
+
+    preset: str = "lite"
+    tracker: dict[str, Any] = field(default_factory=dict)
+    clips: int = 1600
+    matching_steps: int = 2500
+    steps: int = 14000
+    batch: int = 1
+    frames: tuple[int, int] = (8, 16)
+    short: float = 0.85
+    iterations: int = 2
+    train_encoder: bool = False
+    lr: float = 1e-3
+    weight_decay: float = 5e-4
+    warmup: float = 0.05
+    clip_norm: float = 10.0
+    precision: str = "float32"
+    head: float = 0.01
+    seed: int = 0
+    evaluate_every: int = 1000
+    validation: int = 8
+    save_every: int = 250
+    loss: LossConfig = field(default_factory=lambda: LossConfig(visibility=0.5))
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("clips", "steps", "batch", "iterations", "evaluate_every", "save_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"TrainConfig.{name}: expected at least 1, got {getattr(self, name)}")
+        if self.matching_steps < 0 or self.validation < 0:
+            raise ValueError("TrainConfig: matching_steps and validation must not be negative")
+        if self.precision not in ("float32", "bfloat16"):
+            raise ValueError(f'TrainConfig.precision: expected "float32" or "bfloat16", got {self.precision!r}')
+        if self.lr <= 0 or not 0 < self.warmup < 1 or not 0 <= self.short <= 1:
+            raise ValueError("TrainConfig: lr must be positive, warmup in (0, 1), short in [0, 1]")
+        half = self.tracker_config().window // 2
+        object.__setattr__(self, "frames", tuple(self.frames))  # lists come from JSON
+        if min(self.frames) <= half:
+            raise ValueError(f"TrainConfig.frames: expected more than half a window ({half}), got {self.frames}")
+
+    def tracker_config(self) -> TrackerConfig:
+        """What is trained."""
+        return TrackerConfig.preset(self.preset, **self.tracker)
+
+    @property
+    def total(self) -> int:
+        """Steps of both stages."""
+        return self.matching_steps + self.steps
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> TrainConfig:
+        """The inverse of `to_dict`.
+
+        Raises:
+            ValueError: unknown names.
+        """
+        unknown = set(values) - {f.name for f in fields(cls)}
+        if unknown:
+            raise ValueError(f"TrainConfig: unknown {', '.join(sorted(unknown))}; was it written by another version?")
+        parts = {"loss": LossConfig, "motion": MotionConfig, "sampling": SamplingConfig, "matching": MatchingConfig}
+        return cls(**{k: parts[k](**v) if k in parts else v for k, v in values.items()})

@@ -1,0 +1,139 @@
+"""What a tracker is trained on: which clips, which part of a clip, which of its points, in which coordinates.
+
+Paper: appendix (training data). Everything that is drawn for step s comes from a generator seeded by (seed, s), so a
+run that is continued draws what it would have drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tapip3d_lite.clip import Clip, load_clip
+from tapip3d_lite.files import atomic_path
+from tapip3d_lite.model.cloud import quantile_roi
+from tapip3d_lite.model.encoder import Encoder
+from tapip3d_lite.model.frames import Frames, frames_from_clip
+from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
+from tapip3d_lite.simulate.seeds import TRAINING, VALIDATION
+from tapip3d_lite.training.loss import Truth
+
+
+def training_config(seed: int) -> SimulationConfig:
+    """The training clip of a seed: all cameras, with and without occluder and sky, slow and fast, 12 or 24 fps."""
+    rng = np.random.default_rng([7, seed])
+    return SimulationConfig(
+        fps=float(rng.choice([12.0, 12.0, 24.0])),
+        camera=("static", "linear", "arc", "handheld")[seed % 4],
+        handheld=float(rng.uniform(0.3, 2.5)),
+        arc=(15.0, 120.0),
+        occluder=bool(rng.random() < 0.35),
+        sky=bool(rng.random() < 0.2),
+        same_texture=bool(rng.random() < 0.15),
+        speed=float(rng.uniform(0.7, 1.6)),
+        drop=float(rng.uniform(0.8, 1.8)),
+        moving=(3, 12),
+        tracks=384,
+    )
+
+
+def training_clips(folder: str | Path, count: int, progress: bool = True, workers: int | None = None) -> list[Path]:
+    """The paths of the first `count` training clips; those that are missing are simulated."""
+    if not 0 < count <= len(TRAINING):
+        raise ValueError(f"training_clips: count must be in [1, {len(TRAINING)}], got {count}")
+    return simulate_dataset(folder, count, training_config, TRAINING.start, workers, progress)
+
+
+def validation_clips(folder: str | Path, count: int, progress: bool = True) -> list[Clip]:
+    """Held-out clips of the same kind, never trained on; at 12 fps, 64 tracks each."""
+    paths = simulate_dataset(folder, count, _validation_config, VALIDATION.start, None, progress)
+    return [load_clip(path) for path in paths]
+
+
+def _validation_config(seed: int) -> SimulationConfig:
+    return SimulationConfig(camera=("static", "linear", "arc", "handheld")[seed % 4], tracks=64)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B clips of equal length with their truth.
+
+    Attributes:
+        frames: (B, T); colours are left out (empty) where features are given.
+        queries: (B, N, 4).
+        truth: of the same tracks.
+        dynamic: (B, N) bool, points on bodies that move in the world.
+        roi: depths (near, far), each (B, 1, 1, 1), that count for the scale.
+        features: (B, T, C, h, w) of a frozen encoder, or None.
+        names: which clips these are.
+    """
+
+    frames: Frames
+    queries: Tensor
+    truth: Truth
+    dynamic: Tensor
+    roi: tuple[Tensor, Tensor]
+    features: Tensor | None
+    names: tuple[str, ...]
+
+    def to(self, device: torch.device | str) -> Batch:
+        """The batch on another device."""
+        truth = Truth(*(x.to(device) for x in (self.truth.xyz, self.truth.visible, self.truth.times)))
+        features = None if self.features is None else self.features.to(device).float()
+        roi = tuple(x.to(device) for x in self.roi)
+        return Batch(
+            self.frames.to(device), self.queries.to(device), truth, self.dynamic.to(device), roi, features, self.names
+        )
+
+
+def make_batch(clips: list[Clip], features: list[Tensor] | None = None) -> Batch:
+    """Stack clips with as many frames and tracks each.
+
+    Args:
+        clips: with tracks, at the model's image size.
+        features: of each clip (T, C, h, w), if they exist.
+    """
+    parts = [frames_from_clip(clip) for clip in clips]
+    frames = Frames(*(torch.cat([getattr(x, name) for x in parts]) for name in Frames.__dataclass_fields__))
+    tracks = [clip.tracks for clip in clips]
+    queries = torch.stack([torch.from_numpy(x.queries) for x in tracks])
+    xyz, visible = (torch.stack([torch.from_numpy(getattr(x, name)) for x in tracks]) for name in ("xyz", "visible"))
+    still = [np.zeros(x.queries.shape[0], bool) if x.dynamic is None else x.dynamic for x in tracks]
+    near, far = zip(*(quantile_roi(x) for x in frames.depths), strict=True)
+    roi = tuple(torch.tensor(x).view(-1, 1, 1, 1) for x in (near, far))
+    return Batch(
+        frames,
+        queries,
+        Truth(xyz, visible, queries[..., 0].long()),
+        torch.from_numpy(np.stack(still)),
+        roi,
+        None if features is None else torch.stack(features),
+        tuple(clip.name for clip in clips),
+    )
+
+
+class FeatureCache:
+    """Features of whole clips by a frozen encoder, as half floats in files that are made when first asked for."""
+
+    def __init__(self, folder: str | Path, encoder: Encoder) -> None:
+        self.folder, self.encoder = Path(folder), encoder
+
+    @torch.no_grad()
+    def path(self, clip: Path) -> Path:
+        """The file (T, C, h, w) float16 of one clip."""
+        path = self.folder / f"{clip.stem}.npy"
+        if not path.exists():
+            device = next(self.encoder.parameters()).device
+            features = self.encoder(frames_from_clip(load_clip(clip, points=False), device=device).rgb)[0]
+            with atomic_path(path) as temporary:
+                np.save(temporary, features.half().cpu().numpy())
+        return path
+
+    def frames(self, clip: Path, index: np.ndarray) -> Tensor:
+        """Features (len(index), C, h, w) float32 of some frames."""
+        stored = np.load(self.path(clip), mmap_mode="r")
+        return torch.from_numpy(stored[index]).float()

@@ -1,0 +1,125 @@
+"""What a training leaves on disk: its recipe, a line of log a step, a checkpoint; and the bar on the screen.
+
+Everything is written so that a kill at any moment leaves a folder from which the run goes on exactly.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm.auto import tqdm
+
+from tapip3d_lite.files import atomic_path
+from tapip3d_lite.training.config import TrainConfig
+
+_SMOOTH = 0.98  # of the running means that the bar shows
+
+
+class Journal:
+    """The folder of one training.
+
+    Raises:
+        ValueError: the folder holds a training already (without `resume`), or one of another recipe.
+    """
+
+    def __init__(self, folder: str | Path, config: TrainConfig, resume: bool) -> None:
+        self.folder = Path(folder)
+        recipe = self.folder / "config.json"
+        wanted = json.loads(json.dumps(config.to_dict()))
+        if recipe.exists():
+            stored = json.loads(recipe.read_text())
+            different = [f"{k}={stored.get(k)!r} (now {wanted.get(k)!r})" for k in wanted if stored.get(k) != wanted[k]]
+            if not resume:
+                raise ValueError(
+                    f"train: {folder} holds a training already; continue it with --resume, or choose another"
+                )
+            if different:
+                raise ValueError(f"train: {folder} was begun with another recipe: {', '.join(different)}; use its own")
+        else:
+            with atomic_path(recipe) as temporary:
+                temporary.write_text(json.dumps(wanted, indent=2) + "\n")
+
+    def checkpoint(self, device: str) -> dict[str, Any] | None:
+        """The newest checkpoint, or None; the log is cut back to it."""
+        path = self.folder / "checkpoint.pt"
+        saved = torch.load(path, map_location=device, weights_only=True) if path.exists() else None
+        self._cut_log(0 if saved is None else saved["step"])
+        return saved
+
+    def save(self, state: dict[str, Any]) -> None:
+        """Replace the checkpoint, atomically."""
+        with atomic_path(self.folder / "checkpoint.pt") as temporary:
+            torch.save(state, temporary)
+
+    def write(self, line: dict[str, Any]) -> None:
+        """Append one step to the log."""
+        with open(self.folder / "log.jsonl", "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def refuse(self, line: dict[str, Any], norm: float, drawn: dict[str, Any]) -> str:
+        """Save the batch of a step that went wrong; returns what to tell the user."""
+        path = self.folder / f"not_finite_{line['step']}.pt"
+        with atomic_path(path) as temporary:
+            torch.save({"line": line, "norm": norm, **drawn}, temporary)
+        return (
+            f"train: loss {line['loss']} and gradient norm {norm} in step {line['step']} are not finite; nothing was changed "
+            f"by it. Its batch is in {path}, the last good state in {self.folder / 'checkpoint.pt'}; lower the learning rate"
+        )
+
+    def _cut_log(self, step: int) -> None:
+        """Forget lines behind the checkpoint, and a half-written last one."""
+        path = self.folder / "log.jsonl"
+        if not path.exists():
+            return
+        kept = [line for line in read_log(path) if line["step"] <= step]
+        with atomic_path(path) as temporary:
+            temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+
+    @contextlib.contextmanager
+    def bar(self, done: int, total: int, show: bool) -> Iterator[Bar]:
+        """A progress bar over the steps."""
+        with tqdm(total=total, initial=done, unit="step", disable=not show, dynamic_ncols=True) as bar:
+            yield Bar(bar)
+
+
+class Bar:
+    """Running means of what matters, beside speed and remaining time."""
+
+    def __init__(self, bar: tqdm) -> None:
+        self.bar, self.means, self.shown = bar, {}, 0.0
+
+    def show(self, line: dict[str, Any]) -> None:
+        """One more step, with this line of log."""
+        for name in ("loss", "right", "apd", "apd_dynamic"):
+            if line.get(name) is not None:
+                old = self.means.get(name, line[name])
+                self.means[name] = _SMOOTH * old + (1 - _SMOOTH) * line[name]
+        self.bar.update()
+        if time.monotonic() - self.shown > 0.5:
+            self.shown = time.monotonic()
+            self.bar.set_description(line["stage"], refresh=False)
+            shown = ("loss", "right") if line["stage"] == "matching" else ("loss", "apd", "apd_dynamic")
+            self.bar.set_postfix({name: f"{self.means[name]:.3f}" for name in shown if name in self.means})
+
+
+def read_log(path: str | Path) -> list[dict[str, Any]]:
+    """The lines of a `log.jsonl` or of the one in a folder; a half-written last line is left out.
+
+    Raises:
+        ValueError: there is no log.
+    """
+    path = Path(path)
+    path = path / "log.jsonl" if path.is_dir() else path
+    if not path.exists():
+        raise ValueError(f"{path}: no such log; give the folder of a training")
+    lines = []
+    for text in path.read_text(encoding="utf-8").splitlines():
+        with contextlib.suppress(json.JSONDecodeError):
+            lines.append(json.loads(text))
+    return lines

@@ -1,0 +1,129 @@
+"""Teaching the encoder alone, first: the same surface point should have the same feature in any two frames.
+
+Stands in for the paper's initialisation from CoTracker3's encoder (section 4, "implementation"). The loss is InfoNCE:
+a point's feature in one frame is compared with every cell of the other, and should prefer the cells where the point
+really is. It costs minutes, and trackers that start from such features leave the zero-motion solution much sooner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.geometry import project
+from tapip3d_lite.training.sampling import load_part
+
+
+@dataclass(frozen=True)
+class MatchingConfig:
+    """How the encoder is taught to match.
+
+    Attributes:
+        points: most points of a pair of frames.
+        gap: greatest number of frames between the two.
+        levels: pyramid levels at which features are compared, each weighing a third of the one before.
+        spread: standard deviation of the target around the true place, in cells.
+        jitter: strength of random brightness and contrast, drawn for each frame.
+        lr, weight_decay, clip_norm: of AdamW with one cycle.
+    """
+
+    points: int = 128
+    gap: int = 12
+    levels: int = 3
+    spread: float = 0.5
+    jitter: float = 0.2
+    lr: float = 1e-3
+    weight_decay: float = 1e-4
+    clip_norm: float = 1.0
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two frames and where the same points are in both.
+
+    Attributes:
+        rgb: (2, 3, H, W) in [0, 1].
+        uv: (2, N, 2) pixels.
+    """
+
+    rgb: Tensor
+    uv: Tensor
+
+    def to(self, device: torch.device | str) -> Pair:
+        """The pair on another device."""
+        return Pair(self.rgb.to(device), self.uv.to(device))
+
+
+def draw_pair(path: str | Path, rng: np.random.Generator, config: MatchingConfig) -> Pair:
+    """Two random frames of a clip with points that both show, mirrored and re-coloured at random."""
+    clip, points = _two_frames(path, rng, config.gap)
+    chosen = rng.permutation(points)[: config.points]
+    uv = project(clip.tracks.xyz[:, chosen], clip.intrinsics, clip.extrinsics)[0].astype(np.float32)
+    video = clip.video
+    for axis in (0, 1):  # u, v
+        if rng.random() < 0.5:
+            uv[..., axis] = clip.size[1 - axis] - 1 - uv[..., axis]
+            video = np.flip(video, 2 - axis)
+    rgb = np.ascontiguousarray(video.transpose(0, 3, 1, 2)).astype(np.float32) / 255
+    contrast = 1 + config.jitter * rng.uniform(-1, 1, (2, 3, 1, 1)) * (rng.random((2, 1, 1, 1)) < 0.5)
+    brightness = 0.25 * config.jitter * rng.uniform(-1, 1, (2, 1, 1, 1))
+    rgb = np.clip(rgb * contrast + brightness, 0, 1).astype(np.float32)
+    return Pair(torch.from_numpy(rgb), torch.from_numpy(uv))
+
+
+def _two_frames(path: str | Path, rng: np.random.Generator, gap: int) -> tuple[Clip, np.ndarray]:
+    """Frames at most `gap` apart, nearer ones where these share too few points, and the points that both show."""
+
+    def choose(available: int) -> np.ndarray:
+        distance = min(int(rng.integers(1, gap + 1)), available - 1)
+        first = int(rng.integers(available - distance))
+        return rng.permutation([first, first + distance])
+
+    while True:
+        clip = load_part(path, choose)
+        both = np.flatnonzero(clip.tracks.visible.all(0))
+        if len(both) >= 16 or gap == 1:
+            return clip, both
+        gap = max(gap // 2, 1)
+
+
+def matching_loss(encoder: nn.Module, pair: Pair, config: MatchingConfig) -> tuple[Tensor, float]:
+    """InfoNCE over all cells of the other frame.
+
+    Args:
+        encoder: (1, 2, 3, H, W) to (1, 2, C, h, w).
+        pair: two frames.
+        config: levels and their target.
+
+    Returns:
+        The loss, and the share of points whose most similar cell of the finest level lies within 1.5 cells.
+    """
+    maps, total, right = encoder(pair.rgb[None])[0], 0.0, 0.0
+    device = pair.uv.device
+    size = torch.tensor([pair.rgb.shape[3], pair.rgb.shape[2]], device=device)
+    for level in range(config.levels):
+        maps = F.avg_pool2d(maps, 2) if level else maps
+        height, width = maps.shape[-2:]
+        normed = F.layer_norm(maps.movedim(1, -1), maps.shape[1:2])  # as the tracker's tokens are
+        cells = pair.uv * torch.tensor([width, height], device=device) / size
+        grid = cells[0] / torch.tensor([width - 1, height - 1], device=device) * 2 - 1
+        source = normed[:1].movedim(-1, 1)
+        own = F.grid_sample(source, grid[None, None], align_corners=True, padding_mode="border")[0, :, 0].T  # (N, C)
+        scores = own @ normed[1].flatten(0, 1).T / maps.shape[1] ** 0.5  # (N, h w)
+        u, v = cells[1].unbind(-1)
+        across = torch.exp(-((torch.arange(width, device=device) - u[:, None]) ** 2) / (2 * config.spread**2))
+        down = torch.exp(-((torch.arange(height, device=device) - v[:, None]) ** 2) / (2 * config.spread**2))
+        target = (down[:, :, None] * across[:, None]).flatten(1)
+        target = target / target.sum(1, keepdim=True).clamp(min=1e-9)
+        total = total - (target * scores.log_softmax(-1)).sum(-1).mean() / 3**level
+        if level == 0:
+            best = scores.argmax(-1)
+            place = torch.stack([best % width, best // width], -1)
+            right = float(((place - cells[1]).norm(dim=-1) < 1.5).float().mean())
+    return total, right

@@ -1,0 +1,115 @@
+"""Random rigid motions of the coordinates, which make one checkpoint serve camera and world space.
+
+Paper: appendix (training): "everything is moved to the camera frame, then moved by a smoothly varying random rigid
+motion". Between two frames of real camera space the scene moves rigidly as the camera does; a tracker that has seen
+all kinds of such motion, none included, does not care in which frame of reference it is told its points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.geometry import invert, transform
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """How often and how coordinates are moved; lengths are scene units.
+
+    Attributes:
+        world: share of the examples that stay in the world.
+        turned: share that are turned as a whole into random axes; the others are moved to the camera frame.
+        still: share of those in the camera frame that get no further motion.
+        velocity, velocity_noise: greatest speed of the motion and standard deviation of its changes, per frame.
+        rotation, rotation_noise: the same for the angle, radians per frame.
+        smoothing: of the changes, 0 (none) to 1.
+    """
+
+    world: float = 0.7
+    turned: float = 0.1
+    still: float = 0.5
+    velocity: float = 0.03
+    velocity_noise: float = 0.015
+    rotation: float = 0.03
+    rotation_noise: float = 0.015
+    smoothing: float = 0.8
+
+    def __post_init__(self) -> None:
+        shares = self.world, self.turned, self.still, self.smoothing
+        if not all(0 <= x <= 1 for x in shares) or self.world + self.turned > 1:
+            raise ValueError(f"MotionConfig: shares must be in [0, 1], world + turned at most 1; got {shares}")
+        if min(self.velocity, self.velocity_noise, self.rotation, self.rotation_noise) < 0:
+            raise ValueError("MotionConfig: velocity and rotation must not be negative")
+
+
+def smooth_motion(rng: np.random.Generator, frames: int, config: MotionConfig) -> np.ndarray:
+    """A random rigid motion (T, 4, 4) that starts at the identity and whose velocity changes smoothly."""
+    limits = np.array([config.velocity, config.rotation])[:, None]
+    noise = np.array([config.velocity_noise, config.rotation_noise])[:, None]
+    speed = _directions(rng) * rng.uniform(0, 1, (2, 1)) * limits  # (translation, rotation) per frame
+    change, motion = np.zeros((2, 3)), [np.eye(4)]
+    for _ in range(frames - 1):
+        change = config.smoothing * change + (1 - config.smoothing) * noise * rng.normal(size=(2, 3))
+        speed = speed + change
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = cv2.Rodrigues(speed[1])[0], speed[0]
+        motion.append(step @ motion[-1])
+    return np.stack(motion)
+
+
+def move(clip: Clip, motion: np.ndarray) -> Clip:
+    """The same clip told in other coordinates: a point at x in frame t is now at motion[t] x.
+
+    Args:
+        clip: T frames.
+        motion: (T, 4, 4) rigid.
+
+    Returns:
+        The clip with other extrinsics, queries and tracks; what cameras see stays the same.
+    """
+    motion = np.asarray(motion, np.float64)
+    extrinsics = clip.extrinsics.astype(np.float64) @ invert(motion)
+    tracks, queries = clip.tracks, _move_rows(clip.queries, motion)
+    if tracks is not None:
+        xyz = transform(tracks.xyz.astype(np.float64), motion)
+        tracks = replace(tracks, xyz=xyz.astype(np.float32), queries=queries)
+    return replace(clip, extrinsics=extrinsics.astype(np.float32), tracks=tracks, queries=queries)
+
+
+def random_coordinates(clip: Clip, rng: np.random.Generator, config: MotionConfig) -> Clip:
+    """Leave a clip in its world, turn it as a whole, or move it to the camera frame and shake it smoothly."""
+    kind = rng.random()
+    if kind < config.world:
+        return clip
+    frames = len(clip)
+    if kind < config.world + config.turned:
+        turn = np.eye(4)
+        turn[:3, :3] = _random_rotation(rng)
+        return move(clip, np.repeat(turn[None], frames, 0))
+    still = rng.random() < config.still
+    motion = np.eye(4) if still else smooth_motion(rng, frames, config)
+    return move(clip, motion @ clip.extrinsics.astype(np.float64))
+
+
+def _move_rows(rows: np.ndarray | None, motion: np.ndarray) -> np.ndarray | None:
+    if rows is None:
+        return None
+    at = motion[rows[:, 0].astype(int)]
+    xyz = transform(rows[:, None, 1:].astype(np.float64), at)[:, 0]
+    return np.concatenate([rows[:, :1], xyz], -1).astype(np.float32)
+
+
+def _directions(rng: np.random.Generator) -> np.ndarray:
+    rows = rng.normal(size=(2, 3))
+    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+def _random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """Uniform over all rotations: the orthogonal factor of a normal matrix, made proper."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q

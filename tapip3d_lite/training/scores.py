@@ -1,0 +1,74 @@
+"""How well it goes: accuracy on the examples just seen, scores on held-out clips, and the visibility threshold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.evaluation.evaluate import RASTER, evaluate, mean_scores
+from tapip3d_lite.geometry import transform
+from tapip3d_lite.model.scene import Step
+from tapip3d_lite.model.tracker import Tracker
+from tapip3d_lite.training.data import Batch
+
+_THRESHOLDS = (1, 2, 4, 8, 16)  # pixels of the benchmark's raster
+
+
+class Accuracy:
+    """APD3D of the last update of every window, over visible points from their query on; all and dynamic ones."""
+
+    def __init__(self) -> None:
+        self.totals = np.zeros((2, 2))  # (inside, counted) x (all, dynamic)
+
+    @torch.no_grad()
+    def add(self, step: Step, batch: Batch, iterations: int) -> None:
+        """Look at one update; only the last of a window counts."""
+        if step.iteration != iterations - 1:
+            return
+        frames, truth = step.scene.frames, batch.truth
+        index = torch.arange(step.start, step.start + len(frames), device=step.coords.device)
+        real = index.clamp(max=truth.xyz.shape[1] - 1)
+        target, seen = (x[:, real][:, :, step.columns] for x in (truth.xyz, truth.visible))
+        counted = seen & (index[None, :, None] >= truth.times[:, None, step.columns]) & step.active[:, None]
+        counted &= (index < truth.xyz.shape[1])[None, :, None]
+        depth = transform(target, frames.extrinsics)[..., 2].clamp(min=1e-6)
+        focal = (frames.intrinsics[..., 0, 0] * frames.intrinsics[..., 1, 1]).sqrt() * (RASTER / min(frames.size))
+        pixels = (step.xyz - target).norm(dim=-1) / depth * focal[..., None]
+        inside = torch.stack([(pixels < k).float() for k in _THRESHOLDS]).mean(0)
+        for column, mask in enumerate((counted, counted & batch.dynamic[:, None, step.columns])):
+            self.totals[:, column] += float((inside * mask).sum()), float(mask.sum())
+
+    def result(self) -> dict[str, float | None]:
+        """`apd` and `apd_dynamic`, None where nothing was to be seen."""
+        inside, counted = self.totals
+        names = ("apd", "apd_dynamic")
+        return {name: float(inside[i] / counted[i]) if counted[i] else None for i, name in enumerate(names)}
+
+
+def validate(tracker: Tracker, clips: Sequence[Clip]) -> dict[str, float]:
+    """Mean scores on held-out clips in world space, names prefixed by `val_`."""
+    was_training = tracker.training
+    tracker.eval()
+    scores = mean_scores([evaluate(tracker.track(clip, support_grid=0), clip) for clip in clips])
+    tracker.train(was_training)
+    names = ("AJ3D_none", "APD3D_none", "OA", "AJ3D_none_dynamic", "APD3D_none_dynamic", "APD3D_none_static")
+    return {f"val_{name}": round(scores[name], 4) for name in names}
+
+
+def calibrate(tracker: Tracker, clips: Sequence[Clip]) -> float:
+    """Set the config's visibility threshold to the one of the best mean AJ3D (unscaled) on held-out clips."""
+    tracker.eval()
+    tracks = [tracker.track(clip, support_grid=0) for clip in clips]
+
+    def score(threshold: float) -> float:
+        logit = np.log(threshold / (1 - threshold))
+        seen = [replace(x, visible=x.visible_logits >= logit) for x in tracks]
+        return mean_scores([evaluate(x, clip) for x, clip in zip(seen, clips, strict=True)])["AJ3D_none"]
+
+    best = max(np.arange(0.2, 0.96, 0.05).round(2).tolist(), key=score)
+    tracker.config = replace(tracker.config, visible_threshold=best)
+    return best

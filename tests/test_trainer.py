@@ -1,0 +1,172 @@
+"""A training that is killed, interrupted, poisoned or shared by two processes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import tapip3d_lite as t3d
+from tapip3d_lite.simulate import simulate_dataset
+from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.journal import read_log
+from tapip3d_lite.training.motion import MotionConfig
+from tapip3d_lite.training.sampling import SamplingConfig
+from tapip3d_lite.training.trainer import Trainer
+
+SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
+SIZES |= {"context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2}
+SIZES |= {"time_depth": 1, "space_depth": 1, "virtual_tracks": 4}
+
+
+def recipe(**changes):
+    settings = {"tracker": SIZES, "frames": (4, 6), "sampling": SamplingConfig(tracks=6), "save_every": 3}
+    settings |= {"matching_steps": 4, "steps": 12, "evaluate_every": 100, "validation": 0}
+    return TrainConfig(**(settings | changes))
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    config = t3d.SimulationConfig(frames=8, size=(32, 32), tracks=24)
+    return simulate_dataset(tmp_path_factory.mktemp("clips"), 3, config, workers=1, progress=False)
+
+
+def state(folder):
+    return torch.load(folder / "checkpoint.pt", weights_only=True)["model"]
+
+
+RUN = """
+import sys, torch
+from pathlib import Path
+from tests.test_trainer import recipe
+from tapip3d_lite.training.command import interruptible
+from tapip3d_lite.training.trainer import Trainer
+torch.set_num_threads(1)
+trainer = Trainer(sys.argv[1], recipe(), sorted(Path(sys.argv[2]).glob("*.npz")), resume=True)
+with interruptible() as stop:
+    done = trainer.run(stop, watch=lambda line: print(line["step"], flush=True), progress=False)
+sys.exit(0 if done else 130)
+"""
+
+
+def start(folder, clips):
+    return subprocess.Popen(
+        [sys.executable, "-c", RUN, str(folder), str(clips[0].parent)],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=os.path.dirname(os.path.dirname(os.path.abspath(__file__))),
+    )
+
+
+def wait_for(process, step):
+    for line in process.stdout:
+        if int(line) >= step:
+            return
+    raise AssertionError("ended before that step")
+
+
+def test_continuing_after_a_kill_changes_no_bit(tmp_path, clips):
+    torch.set_num_threads(1)
+    Trainer(tmp_path / "whole", recipe(), clips).run(progress=False)
+    with start(tmp_path / "killed", clips) as process:
+        wait_for(process, 8)  # checkpoints stand at 3, 6, 9, ...
+        process.send_signal(signal.SIGKILL)
+    with open(tmp_path / "killed" / "log.jsonl", "a") as log:
+        log.write('{"step": 9, "lo')  # what a kill may leave
+    trainer = Trainer(tmp_path / "killed", recipe(), clips, resume=True)
+    assert 0 < trainer.step < 16
+    assert trainer.run(progress=False)
+    whole, killed = state(tmp_path / "whole"), state(tmp_path / "killed")
+    assert all(torch.equal(whole[name], killed[name]) for name in whole)
+    logs = [
+        [{k: v for k, v in line.items() if k != "seconds"} for line in read_log(tmp_path / x)]
+        for x in ("whole", "killed")
+    ]
+    assert logs[0] == logs[1]
+    assert [line["step"] for line in logs[0]] == list(range(1, 17))
+    assert t3d.load_tracker(tmp_path / "killed" / "weights.safetensors").config.window == 4
+
+
+def test_interrupt_saves_between_two_steps(tmp_path, clips):
+    with start(tmp_path, clips) as process:
+        wait_for(process, 2)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+    assert process.returncode == 130
+    saved = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert saved["step"] == read_log(tmp_path)[-1]["step"] < 16
+
+
+def test_a_loss_that_is_not_finite_stops_with_its_batch(tmp_path, clips):
+    trainer = Trainer(tmp_path, recipe(matching_steps=0), clips)
+    with torch.no_grad():
+        trainer.tracker.updater.head.bias[0] = torch.nan
+    before = {name: x.clone() for name, x in trainer.tracker.state_dict().items()}
+    with pytest.raises(FloatingPointError, match=r"step 1 are not finite.*not_finite_1\.pt"):
+        trainer.run(progress=False)
+    batch = torch.load(tmp_path / "not_finite_1.pt", weights_only=True)
+    assert batch["queries"].shape == (1, 6, 4) and batch["truth"]["xyz"].shape == (1, 4, 6, 3)
+    after = trainer.tracker.state_dict()
+    assert all(torch.equal(after[name].nan_to_num(), before[name].nan_to_num()) for name in before)
+
+
+def test_training_overfits_one_clip(tmp_path, clips):
+    whole = {"sampling": SamplingConfig(tracks=24, seen=0.0, anywhere=0.0, backward=0.0), "frames": (8, 8)}
+    world = {"motion": MotionConfig(world=1.0, turned=0.0)}  # so every step sees the same example
+    config = recipe(matching_steps=0, steps=150, lr=2e-3, save_every=1000, head=1e-3, **whole, **world)
+    trainer = Trainer(tmp_path, config, clips[:1])
+    assert trainer.run(progress=False)
+    losses = [line["position"] for line in read_log(tmp_path)]
+    assert np.mean(losses[-30:]) < 0.6 * np.mean(losses[:30])
+
+
+def _gradients(rank, size, folder, clips, batch):
+    torch.set_num_threads(1)
+    if size > 1:
+        address = f"file://{folder}/meet"
+        torch.distributed.init_process_group("gloo", init_method=address, rank=rank, world_size=size)
+    trainer = Trainer(f"{folder}/{size}_{rank}", recipe(matching_steps=0, batch=batch), clips)
+    trainer.optimizer.zero_grad()
+    trainer._track()
+    trainer.group.average(trainer.parameters)
+    torch.save([p.grad for p in trainer.parameters], f"{folder}/gradients_{size}_{rank}.pt")
+    if size > 1:
+        torch.distributed.destroy_process_group()
+
+
+def test_two_processes_give_the_gradients_of_one_with_twice_the_batch(tmp_path, clips):
+    torch.multiprocessing.spawn(_gradients, (2, str(tmp_path), clips, 1), nprocs=2)
+    _gradients(0, 1, str(tmp_path), clips, 2)
+    first, second, alone = (
+        torch.load(tmp_path / f"gradients_{name}.pt", weights_only=True) for name in ("2_0", "2_1", "1_0")
+    )
+    assert len(alone) > 20 and sum(float(x.abs().sum()) for x in alone) > 0
+    for a, b, c in zip(first, second, alone, strict=True):
+        assert torch.equal(a, b)
+        torch.testing.assert_close(a, c, rtol=1e-4, atol=1e-7)
+
+
+def test_a_folder_holds_one_recipe(tmp_path, clips):
+    Trainer(tmp_path, recipe(), clips)
+    with pytest.raises(ValueError, match="--resume"):
+        Trainer(tmp_path, recipe(), clips)
+    with pytest.raises(ValueError, match="lr="):
+        Trainer(tmp_path, recipe(lr=1e-5), clips, resume=True)
+    with pytest.raises(ValueError, match="no training clips"):
+        Trainer(tmp_path / "other", recipe(), [])
+    again = TrainConfig.from_dict(json.loads((tmp_path / "config.json").read_text()))
+    assert again.tracker_config() == recipe().tracker_config() and again.sampling == recipe().sampling
+    with pytest.raises(ValueError, match="unknown colour"):
+        TrainConfig.from_dict({"colour": 1})
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"steps": 0}, {"frames": (2, 6)}, {"precision": "int8"}, {"lr": 0.0}, {"matching_steps": -1}]
+)
+def test_recipes_that_cannot_work(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        recipe(**wrong)
