@@ -42,10 +42,10 @@ class TrainConfig:
     tracker: dict[str, Any] = field(default_factory=dict)
     clips: int = 1600
     matching_steps: int = 2500
-    steps: int = 14000
+    steps: int = 11000
     batch: int = 1
     frames: tuple[int, int] = (8, 16)
-    short: float = 0.85
+    short: float = 0.9
     iterations: int = 2
     train_encoder: bool = False
     lr: float = 1e-3
