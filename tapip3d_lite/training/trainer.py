@@ -66,9 +66,10 @@ class Trainer:
             raise ValueError("Trainer: no training clips; make some with `training_clips` or `simulate`")
         self.config, self.clips, self.validation, self.device = config, list(clips), list(validation), device
         self.journal = Journal(folder, config, resume)
-        torch.manual_seed(config.seed)
-        self.tracker = Tracker(config.tracker_config()).to(device).train()
-        nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
+        with torch.random.fork_rng():  # the caller's chance is not ours
+            torch.manual_seed(config.seed)
+            self.tracker = Tracker(config.tracker_config()).to(device).train()
+            nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
         self.group, self.step, self.seconds = Group(), 0, 0.0
         self.cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder)
         saved = self.journal.checkpoint(device)
