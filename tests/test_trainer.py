@@ -124,6 +124,17 @@ def test_training_overfits_one_clip(tmp_path, clips):
     assert np.mean(losses[-30:]) < 0.6 * np.mean(losses[:30])
 
 
+@pytest.mark.parametrize("train_encoder", [False, True])
+def test_half_precision_follows_single_precision(tmp_path, clips, train_encoder):
+    positions = {}
+    for precision in ("float32", "bfloat16"):
+        config = recipe(precision=precision, steps=3, matching_steps=0, train_encoder=train_encoder)
+        assert Trainer(tmp_path / precision, config, clips).run(progress=False)
+        positions[precision] = [line["position"] for line in read_log(tmp_path / precision)]
+    assert positions["bfloat16"] != positions["float32"]
+    assert positions["bfloat16"] == pytest.approx(positions["float32"], rel=0.05)
+
+
 def _gradients(rank, size, folder, clips, batch):
     torch.set_num_threads(1)
     if size > 1:
