@@ -42,7 +42,7 @@ class TrainConfig:
     tracker: dict[str, Any] = field(default_factory=dict)
     clips: int = 1600
     matching_steps: int = 2500
-    steps: int = 11000
+    steps: int = 10000
     batch: int = 1
     frames: tuple[int, int] = (8, 16)
     short: float = 0.9
