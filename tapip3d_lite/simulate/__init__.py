@@ -5,6 +5,6 @@ from __future__ import annotations
 from tapip3d_lite.simulate.config import SimulationConfig
 from tapip3d_lite.simulate.dataset import simulate_dataset
 from tapip3d_lite.simulate.recording import Recording
-from tapip3d_lite.simulate.simulator import record, render_clip, simulate_clip
+from tapip3d_lite.simulate.simulator import object_maps, record, render_clip, simulate_clip
 
-__all__ = ["Recording", "SimulationConfig", "record", "render_clip", "simulate_clip", "simulate_dataset"]
+__all__ = ["Recording", "SimulationConfig", "object_maps", "record", "render_clip", "simulate_clip", "simulate_dataset"]

@@ -58,6 +58,17 @@ def render_clip(recording: Recording) -> Clip:
     Raises:
         ValueError: the scene that the seed makes here has other bodies than the recording's.
     """
+    return _film_all(recording, _shoot(_remake(recording), recording))
+
+
+def object_maps(recording: Recording) -> np.ndarray:
+    """What every pixel's centre sees: (T, H, W) int32, -1 the sky, 0 the room (floor and backdrop), then the bodies."""
+    scene = _remake(recording)
+    geom = np.stack([hits.geom.reshape(recording.config.size) for hits in _shoot(scene, recording).hits])
+    return np.where(geom < 0, -1, np.maximum(geom - scene.first_body + 1, 0)).astype(np.int32)
+
+
+def _remake(recording: Recording) -> Scene:
     rng = np.random.default_rng([recording.attempt, recording.seed])
     scene = random_scene(rng, recording.config, random_path(rng, recording.config).azimuth.mean())
     if recording.states.shape[2] != scene.model.nq:
@@ -65,7 +76,7 @@ def render_clip(recording: Recording) -> Clip:
             f"render_clip: seed {recording.seed} makes a scene with {scene.model.nq} positions here, the recording has "
             f"{recording.states.shape[2]}; it was made by another version of the simulator"
         )
-    return _film_all(recording, _shoot(scene, recording))
+    return scene
 
 
 def _record(seed: int, config: SimulationConfig) -> tuple[Recording, Shots]:

@@ -23,9 +23,10 @@ class TrainConfig:
         matching_steps: steps that teach the encoder alone to match; 0 leaves it random.
         steps: steps that train the tracker.
         batch: clips a step (of each process).
-        frames: (first, last) frames of an example; `short` of the steps use the first number, the others the last.
-        short: share of the steps with short examples, which come first.
-        iterations: M while training; `iterations` of the tracker's config are used at test.
+        frames: (fewest, most) frames of an example; drawn for each step, in steps of half a window.
+        iterations: (fewest, most) updates of a window; drawn for each step. One number stands for both.
+        short: share of the steps, the first ones, that take the fewest of both: what is near zero motion is learned
+            first, then to start from estimates that are nearly right, as later updates and windows do.
         train_encoder: train the encoder along; otherwise its features are kept in files, and a step costs half.
         lr, weight_decay, warmup, clip_norm: AdamW with one cosine cycle (the paper's: 5e-4, 5e-4, 0.05, 10).
         precision: `"float32"`, or `"bfloat16"` for autocast.
@@ -42,11 +43,11 @@ class TrainConfig:
     tracker: dict[str, Any] = field(default_factory=dict)
     clips: int = 1600
     matching_steps: int = 2500
-    steps: int = 10000
+    steps: int = 6000
     batch: int = 1
     frames: tuple[int, int] = (8, 16)
-    short: float = 0.9
-    iterations: int = 2
+    iterations: tuple[int, int] = (2, 4)
+    short: float = 0.35
     train_encoder: bool = False
     lr: float = 1e-3
     weight_decay: float = 5e-4
@@ -64,7 +65,12 @@ class TrainConfig:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
 
     def __post_init__(self) -> None:
-        for name in ("clips", "steps", "batch", "iterations", "evaluate_every", "save_every"):
+        for name in ("frames", "iterations"):
+            value = getattr(self, name)  # lists come from JSON
+            object.__setattr__(self, name, (value, value) if isinstance(value, int) else tuple(value))
+            if len(getattr(self, name)) != 2 or not 1 <= getattr(self, name)[0] <= getattr(self, name)[1]:
+                raise ValueError(f"TrainConfig.{name}: expected (fewest, most), both at least 1, got {value}")
+        for name in ("clips", "steps", "batch", "evaluate_every", "save_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"TrainConfig.{name}: expected at least 1, got {getattr(self, name)}")
         if self.matching_steps < 0 or self.validation < 0:
@@ -74,7 +80,6 @@ class TrainConfig:
         if self.lr <= 0 or not 0 < self.warmup < 1 or not 0 <= self.short <= 1:
             raise ValueError("TrainConfig: lr must be positive, warmup in (0, 1), short in [0, 1]")
         half = self.tracker_config().window // 2
-        object.__setattr__(self, "frames", tuple(self.frames))  # lists come from JSON
         if min(self.frames) <= half:
             raise ValueError(f"TrainConfig.frames: expected more than half a window ({half}), got {self.frames}")
 

@@ -129,16 +129,23 @@ class Trainer:
             }
             self.journal.save(state)
 
+    def lengths(self, step: int) -> tuple[int, int]:
+        """Frames and iterations M of a step, the same in all processes."""
+        config, rng = self.config, np.random.default_rng([self.config.seed, step])
+        if step - config.matching_steps < config.short * config.steps:
+            return config.frames[0], config.iterations[0]
+        half = config.tracker_config().window // 2
+        frames = rng.choice(np.arange(config.frames[0], config.frames[1] + 1, half))
+        return int(frames), int(rng.integers(config.iterations[0], config.iterations[1] + 1))
+
     def draw(self, step: int, slot: int) -> tuple[Clip, torch.Tensor | None]:
         """The clip of one slot of a step's batch, and its features if the encoder is frozen."""
         config, rng = self.config, np.random.default_rng([self.config.seed, step, slot])
-        path = self.clips[rng.integers(len(self.clips))]
-        short = step - config.matching_steps < config.short * config.steps
+        path, wanted = self.clips[rng.integers(len(self.clips))], self.lengths(step)[0]
         chosen = np.zeros(0, int)
 
         def choose(available: int) -> np.ndarray:
             nonlocal chosen
-            wanted = config.frames[0 if short else 1]
             chosen = draw_frames(rng, available, wanted, config.sampling.backward)
             return chosen
 
@@ -184,9 +191,9 @@ class Trainer:
         return {"loss": float(loss.detach()), "right": right}
 
     def _track(self) -> dict:
-        batch, accuracy = self.batch(self.step), Accuracy()
+        batch, accuracy, iterations = self.batch(self.step), Accuracy(), self.lengths(self.step)[1]
         self._drawn = {"names": batch.names, "queries": batch.queries, "truth": vars(batch.truth)}
-        options = {"iterations": self.config.iterations, "depth_roi": batch.roi, "features": batch.features}
+        options = {"iterations": iterations, "depth_roi": batch.roi, "features": batch.features}
         with torch.autocast(self.device, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
             totals = saving_backward(
                 self.tracker,
@@ -194,7 +201,7 @@ class Trainer:
                 batch.queries,
                 batch.truth,
                 self.config.loss,
-                watch=lambda step: accuracy.add(step, batch, self.config.iterations),
+                watch=lambda step: accuracy.add(step, batch, iterations),
                 **options,
             )
         return totals | accuracy.result()
