@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import plotly.graph_objects as go
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
@@ -13,9 +15,77 @@ from tapip3d_lite.clip import Clip
 from tapip3d_lite.evaluation.neighborhoods import Cells, track_objects
 from tapip3d_lite.geometry import project, transform, unproject
 from tapip3d_lite.ui.figures2d import INK, _image, _plot, check_drawable
+from tapip3d_lite.ui.figures3d import _limits, _step_args
 
 QUERY, RIGHT, WRONG = "#e8a33d", "#2b6cb0", "#d1495b"
 NAMES = {"window": "window in the image", "knn": "k-NN in 3D"}
+
+
+@dataclass(frozen=True)
+class Around:
+    """A true point in a frame with both of its neighbourhoods.
+
+    Attributes:
+        clip: with true tracks.
+        frame: frame index.
+        cells: of the frame and level.
+        xyz: (3,) the point, world.
+        uv: (2,) its pixel.
+        seen: whether it is visible.
+        found: kind of neighbourhood to indices (K,) of its cells, the nearest or the upper left first.
+        right: kind to (K,) bool, which of them lie on the point's own object.
+    """
+
+    clip: Clip
+    frame: int
+    cells: Cells
+    xyz: np.ndarray
+    uv: np.ndarray
+    seen: bool
+    found: Mapping[str, np.ndarray]
+    right: Mapping[str, np.ndarray]
+
+    @classmethod
+    def of(
+        cls, clip: Clip, objects: np.ndarray, track: int, frame: int, neighbors: int, level: int = 0, stride: int = 4
+    ) -> Around:
+        """Collect them; arguments as for `two_neighborhoods`."""
+        check_drawable(clip, frame=frame)
+        if not 0 <= track < clip.tracks.xyz.shape[1]:
+            raise ValueError(f"track: expected 0 to {clip.tracks.xyz.shape[1] - 1}, got {track}; choose another")
+        xyz = clip.tracks.xyz[frame, track : track + 1]
+        uv, z = project(xyz, clip.intrinsics[frame], clip.extrinsics[frame])
+        if z[0] <= 0 or (uv < -0.5).any() or (uv > np.array(clip.size[::-1]) - 0.5).any():
+            raise ValueError(f"track {track} is outside the image in frame {frame}; choose another frame or track")
+        cells, own = Cells.of(clip, objects, frame, stride << level), track_objects(clip, objects)[track]
+        found = {kind: cells.near(xyz, uv, neighbors, kind)[0] for kind in NAMES}
+        right = {kind: cells.objects.ravel()[index] == own for kind, index in found.items()}
+        return cls(clip, frame, cells, xyz[0], uv[0], bool(clip.tracks.visible[frame, track]), found, right)
+
+    def points(self, kind: str) -> np.ndarray:
+        """(K, 3), camera frame."""
+        return transform(self.cells.points.reshape(-1, 3)[self.found[kind]], self.clip.extrinsics[self.frame])
+
+    def pixels(self, kind: str) -> np.ndarray:
+        """(K, 2)."""
+        return self.cells.uv.reshape(-1, 2)[self.found[kind]]
+
+    def surroundings(self, box: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Points (P, 3), camera frame, and colours (P, 3) of the pixels in a box, near the neighbours in depth."""
+        left, top, end, bottom = (round(x) for x in box)
+        v, u = (x.ravel() for x in np.mgrid[top : bottom + 1, left : end + 1])
+        depth = self.clip.depths[self.frame, v, u]
+        limits = np.concatenate([self.points(kind)[:, 2] for kind in NAMES])
+        shown = (depth > 0) & (depth > limits.min() - 0.5) & (depth < limits.max() + 0.5)
+        uv = np.stack([u, v], -1)[shown].astype(np.float32)
+        return unproject(uv, depth[shown], self.clip.intrinsics[self.frame]), self.clip.video[self.frame, v, u][shown]
+
+    def box(self, margin: float = 8) -> tuple[float, ...]:
+        """(left, top, right, bottom) of a square of pixels around everything, moved into the image where it fits."""
+        places, wide = np.stack([self.uv, *self.pixels("window"), *self.pixels("knn")]), self.clip.size[::-1]
+        side = min(np.ptp(places, axis=0).max() + 2 * margin, min(wide) - 1)
+        low = np.clip((places.min(0) + places.max(0) - side) / 2, 0, np.array(wide) - 1 - side)
+        return (*low, *(low + side))
 
 
 def two_neighborhoods(
@@ -35,27 +105,54 @@ def two_neighborhoods(
     Raises:
         ValueError: no such frame or track, or a point outside the image.
     """
-    check_drawable(clip, frame=frame)
-    if not 0 <= track < clip.tracks.xyz.shape[1]:
-        raise ValueError(f"track: expected 0 to {clip.tracks.xyz.shape[1] - 1}, got {track}; choose another")
-    xyz, seen = clip.tracks.xyz[frame, track : track + 1], clip.tracks.visible[frame, track]
-    uv, z = project(xyz, clip.intrinsics[frame], clip.extrinsics[frame])
-    if z[0] <= 0 or (uv < -0.5).any() or (uv > np.array(clip.size[::-1]) - 0.5).any():
-        raise ValueError(f"track {track} is outside the image in frame {frame}; choose another frame or track")
-    cells, own = Cells.of(clip, objects, frame, stride << level), track_objects(clip, objects)[track]
-    found = {kind: cells.near(xyz, uv, neighbors, kind)[0] for kind in NAMES}
-    places = np.concatenate([uv, *(cells.uv.reshape(-1, 2)[i] for i in found.values())])
-    box = _square(places, clip.size)
-    everything = cells.points.reshape(-1, 3)[np.concatenate(list(found.values()))]
+    around = Around.of(clip, objects, track, frame, neighbors, level, stride)
+    box = around.box()
     figure = Figure(figsize=(11.2, 3.0), layout="constrained")
-    for column, (kind, index) in enumerate(found.items()):
-        right = cells.objects.ravel()[index] == own
-        title = f"frame {frame} · {NAMES[kind]}: {right.sum()} of {neighbors} right"
+    for column, kind in enumerate(NAMES):
         ax = figure.add_subplot(1, 4, 2 * column + 1)
-        _in_image(ax, clip, frame, cells.uv.reshape(-1, 2)[index], right, box, title)
-        ax.scatter(*uv[0], s=90, marker="*", color=QUERY if seen else "none", edgecolors="white" if seen else QUERY)
+        right = around.right[kind].sum()
+        _in_image(ax, around, kind, box, f"frame {frame} · {NAMES[kind]}: {right} of {neighbors} right")
         ax = figure.add_subplot(1, 4, 2 * column + 2, projection="3d", computed_zorder=False)
-        _in_space(ax, clip, frame, cells.points.reshape(-1, 3)[index], right, box, xyz[0], everything)
+        _in_space(ax, around, kind, box)
+    return figure
+
+
+def neighborhoods_3d(
+    clip: Clip, objects: np.ndarray, track: int, frame: int = 0, counts: Sequence[int] = (1, 4, 9, 16, 32)
+) -> go.Figure:
+    """Both neighbourhoods of a true point in space, to be turned, with a slider over K; camera coordinates, metres.
+
+    Args:
+        clip: with true tracks.
+        objects: (T, H, W).
+        track: whose true position in the frame is the query.
+        frame: frame index.
+        counts: values of K, rising.
+    """
+    steps = [Around.of(clip, objects, track, frame, k) for k in counts]
+    cloud, rgb = steps[-1].surroundings(steps[-1].box())
+    colors = [f"rgb({r},{g},{b})" for r, g, b in rgb]
+    query = transform(steps[0].xyz[None], clip.extrinsics[frame])
+    styles = (("circle", "k-NN in 3D", "knn", 6), ("square-open", "window in the image", "window", 8))
+    frames = [
+        go.Frame(name=str(k), data=[_marks(at, *style) for style in styles], traces=[2, 3])
+        for k, at in zip(counts, steps, strict=True)
+    ]
+    fixed = [_markers(cloud, "scene", 3, colors), _markers(query, "query", 7, QUERY, symbol="diamond")]
+    figure = go.Figure(data=[*fixed, *frames[0].data], frames=frames)
+    limits = _limits(np.concatenate([cloud, query, *(steps[-1].points(kind) for kind in NAMES)]))
+    axes = {f"{k}axis": {"range": r.tolist(), "autorange": False} for k, r in zip("xyz", limits, strict=True)}
+    axes["yaxis"]["range"].reverse()  # the image's y points down
+    view = {"up": {"x": 0, "y": 1, "z": 0}, "eye": {"x": -1.6, "y": 0.7, "z": -0.9}}
+    args = _step_args(0, "immediate")
+    steps_of_k = [{"label": str(k), "method": "animate", "args": [[str(k)], args]} for k in counts]
+    figure.update_layout(
+        scene=axes | {"aspectmode": "data", "camera": view},
+        height=460,
+        margin={"l": 0, "r": 0, "t": 10, "b": 0},
+        uirevision="keep",
+        sliders=[{"steps": steps_of_k, "currentvalue": {"prefix": "K = "}}],
+    )
     return figure
 
 
@@ -121,52 +218,41 @@ def proof_view(
     return figure
 
 
-def _square(places: np.ndarray, size: tuple[int, int], margin: float = 8) -> tuple[float, float, float, float]:
-    """(left, top, right, bottom) of a square around places (n, 2), moved into the image where it fits."""
-    side = min(np.ptp(places, axis=0).max() + 2 * margin, min(size) - 1)
-    middle = (places.min(0) + places.max(0)) / 2
-    low = np.clip(middle - side / 2, 0, np.array(size[::-1]) - 1 - side)
-    return (*low, *(low + side))
-
-
-def _in_image(
-    ax: Axes, clip: Clip, frame: int, uv: np.ndarray, right: np.ndarray, box: tuple[float, ...], title: str
-) -> None:
-    _image(ax, clip.video[frame], title)
+def _in_image(ax: Axes, around: Around, kind: str, box: tuple[float, ...], title: str) -> None:
+    _image(ax, around.clip.video[around.frame], title)
     left, top, end, bottom = box
     ax.set_xlim(left - 0.5, end + 0.5)
     ax.set_ylim(bottom + 0.5, top - 0.5)
-    for which, color, marker in ((right, RIGHT, "o"), (~right, WRONG, "X")):
-        ax.scatter(*uv[which].T, s=34, color=color, marker=marker, edgecolors="white", linewidths=0.6)
+    for which, color, marker in ((around.right[kind], RIGHT, "o"), (~around.right[kind], WRONG, "X")):
+        style = {"s": 34, "color": color, "marker": marker, "edgecolors": "white", "linewidths": 0.6}
+        ax.scatter(*around.pixels(kind)[which].T, **style)
+    fill, edge = (QUERY, "white") if around.seen else ("none", QUERY)
+    ax.scatter(*around.uv, s=90, marker="*", color=fill, edgecolors=edge)
 
 
-def _in_space(
-    ax: Axes,
-    clip: Clip,
-    frame: int,
-    cells: np.ndarray,
-    right: np.ndarray,
-    box: tuple[float, ...],
-    query: np.ndarray,
-    everything: np.ndarray,
-) -> None:
-    """The same part of the scene, seen from the side, cut off in depth just behind and before `everything`."""
-    left, top, end, bottom = (round(x) for x in box)
-    v, u = (x.ravel() for x in np.mgrid[top : bottom + 1, left : end + 1])
-    depth, camera = clip.depths[frame, v, u], transform(np.stack([query, *cells]), clip.extrinsics[frame])
-    limits = transform(everything, clip.extrinsics[frame])[:, 2]
-    shown = (depth > limits.min() - 0.5) & (depth < limits.max() + 0.5) & (depth > 0)
-    uv = np.stack([u, v], -1)[shown].astype(np.float32)
-    x, y, z = unproject(uv, depth[shown], clip.intrinsics[frame]).T
-    ax.scatter(x, z, -y, c=clip.video[frame, v, u][shown] / 255, s=4, depthshade=False, linewidths=0, alpha=0.7)
-    for which, color, marker in ((right, RIGHT, "o"), (~right, WRONG, "X")):
-        x, y, z = camera[1:][which].T
-        style = {"s": 26, "color": color, "marker": marker, "edgecolors": "white", "linewidths": 0.5}
+def _in_space(ax: Axes, around: Around, kind: str, box: tuple[float, ...]) -> None:
+    """The same part of the scene, seen from the side: camera coordinates, depth to the right, up is up."""
+    (x, y, z), rgb = around.surroundings(box)[0].T, around.surroundings(box)[1]
+    ax.scatter(x, z, -y, c=rgb / 255, s=4, depthshade=False, linewidths=0, alpha=0.7)
+    query = transform(around.xyz[None], around.clip.extrinsics[around.frame])
+    right, cells = around.right[kind], around.points(kind)
+    marks = ((cells[right], RIGHT, "o", 26), (cells[~right], WRONG, "X", 26), (query, QUERY, "*", 80))
+    for points, color, marker, size in marks:
+        x, y, z = points.T
+        style = {"s": size, "color": color, "marker": marker, "edgecolors": "white", "linewidths": 0.5}
         ax.scatter(x, z, -y, depthshade=False, **style)
-    x, y, z = camera[0]
-    ax.scatter(x, z, -y, s=80, color=QUERY, marker="*", edgecolors="white", linewidths=0.5, depthshade=False)
-    spans = [max(np.ptp(values), 1e-3) for values in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim())]
-    ax.set_box_aspect(spans, zoom=1.15)
+    ax.set_box_aspect([max(np.ptp(f()), 1e-3) for f in (ax.get_xlim, ax.get_ylim, ax.get_zlim)], zoom=1.15)
     ax.view_init(elev=22, azim=-25)
     ax.set(xticklabels=[], yticklabels=[], zticklabels=[])
     ax.set_ylabel("depth", fontsize=7, labelpad=-12)
+
+
+def _marks(around: Around, symbol: str, name: str, kind: str, size: int) -> go.Scatter3d:
+    colors = [RIGHT if right else WRONG for right in around.right[kind]]
+    return _markers(around.points(kind), name, size, colors, symbol=symbol)
+
+
+def _markers(points: np.ndarray, name: str, size: int, color: object, **style: object) -> go.Scatter3d:
+    x, y, z = points.astype(np.float32).T
+    marker = {"size": size, "color": color, "line": {"width": 0}} | style
+    return go.Scatter3d(x=x, y=y, z=z, name=name, mode="markers", marker=marker, hoverinfo="name")
