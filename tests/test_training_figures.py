@@ -1,0 +1,188 @@
+"""Figures and live plot of notebook 06, by their state; how many steps fit into a time; the miniature chain."""
+
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+import tapip3d_lite as t3d
+from tapip3d_lite.simulate import simulate_dataset
+from tapip3d_lite.training import plan
+from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.plan import fit_to_time
+from tapip3d_lite.training.sampling import SamplingConfig
+from tapip3d_lite.training.trainer import Trainer
+from tapip3d_lite.ui.augmentations import TITLES, before_and_after, motion_paths
+from tapip3d_lite.ui.exercises.chain import Chain, plain, saving
+from tapip3d_lite.ui.motion import MOVING
+from tapip3d_lite.ui.training import LivePlot, learning_curve, tracks_and_truth, train_live
+
+SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
+SIZES |= {"context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2}
+SIZES |= {"time_depth": 1, "space_depth": 1, "virtual_tracks": 4}
+
+
+def recipe(**changes):
+    settings = {"tracker": SIZES, "frames": (4, 4), "sampling": SamplingConfig(tracks=6), "save_every": 100}
+    return TrainConfig(**(settings | {"matching_steps": 2, "steps": 4, "evaluate_every": 2, "validation": 1} | changes))
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    config = t3d.SimulationConfig(frames=6, size=(32, 32), tracks=24)
+    return simulate_dataset(tmp_path_factory.mktemp("clips"), 2, config, workers=1, progress=False)
+
+
+@pytest.fixture
+def lines():
+    first = [{"step": i, "stage": "matching", "right": i / 4, "loss": 1.0, "seconds": i} for i in (1, 2)]
+    values = [{"loss": 0.4, "apd": 0.2, "apd_dynamic": None}, {"loss": 0.2, "apd": 0.4, "apd_dynamic": 0.1}]
+    then = [{"step": 3 + i, "stage": "tracking", "seconds": 60 * (i + 1), **v} for i, v in enumerate(values)]
+    then[-1] |= {"val_APD3D_none": 0.5, "val_APD3D_none_dynamic": 0.3}
+    return first + then
+
+
+def drawn(ax):
+    return [tuple(np.round(x, 6).tolist() for x in line.get_data()) for line in ax.lines]
+
+
+def test_curves_show_each_line_its_mean_and_what_was_held_out(lines):
+    zero = {"APD3D_none": 0.45, "APD3D_none_dynamic": 0.15, "OA": 0.9}
+    left, middle, right = learning_curve(lines, zero, window=2).axes
+    assert drawn(left) == [([1, 2], [0.25, 0.5]), ([1, 2], [0.25, 0.375])]
+    assert drawn(middle) == [([3, 4], [0.4, 0.2]), ([3, 4], [0.4, 0.3])] and middle.get_yscale() == "log"
+    assert drawn(right)[:3] == [([3, 4], [0.2, 0.4]), ([3, 4], [0.2, 0.3]), ([4], [0.5])]
+    assert drawn(right)[4:7] == [([4], [0.1]), ([4], [0.1]), ([4], [0.3])]  # a step without moving points is left out
+    assert [drawn(right)[i][1] for i in (3, 7)] == [[0.45] * 2, [0.15] * 2]
+    assert [line.get_linestyle() for line in right.lines].count("--") == 2
+
+
+def test_curves_over_minutes_of_a_window_and_of_nothing(lines):
+    middle = learning_curve(lines, by="minutes", window=1).axes[1]
+    assert drawn(middle) == [([1, 2], [0.4, 0.2])] * 2
+    assert not any(ax.lines for ax in learning_curve([]).axes if ax.get_ylabel() != "APD3D")
+    for wrong in ({"by": "day"}, {"window": 0}):
+        with pytest.raises(ValueError, match="learning_curve"):
+            learning_curve(lines, **wrong)
+
+
+def test_learnt_tracks_stand_beside_the_truth():
+    clip = t3d.simulate_clip(seed=4, frames=6, size=(32, 32), tracks=30)
+    pred = t3d.load_tracker("static").track(clip)
+    figure = tracks_and_truth(clip, pred, [3, 5])
+    assert [ax.get_title() for ax in figure.axes] == [f"{w} · frame {t}" for w in ("truth", "learnt") for t in (3, 5)]
+    shown = int((clip.tracks.visible[5] & (clip.tracks.queries[:, 0] <= 5) & clip.tracks.dynamic).sum())
+    truth, learnt = figure.axes[1], figure.axes[3]
+    dots = [line for line in truth.lines if line.get_color() == MOVING]
+    assert len(dots) == shown > 0
+    assert len(learnt.lines) == len(truth.lines) + shown  # what it misses by
+    for line in dots:
+        uv = t3d.geometry.project(clip.tracks.xyz[5:], clip.intrinsics[5:], clip.extrinsics[5:])[0][0]
+        assert np.abs(uv - np.array(line.get_data())[:, 0]).sum(-1).min() < 1e-4
+    with pytest.raises(ValueError, match="same queries"):
+        tracks_and_truth(clip, pred.select(np.arange(3)))
+
+
+def test_the_live_plot_redraws_in_time_and_can_be_stopped(lines):
+    live = LivePlot(lines[:1], every=1e9)
+    before = live.picture.value
+    live.watch(lines[1])
+    assert live.picture.value == before and live.lines == lines[:2]  # too soon
+    live.every = 0
+    live.watch(lines[2])
+    assert live.picture.value != before and "tracking, step 3" in live.words.value
+    assert not live.stopped
+    live.button.click()
+    assert live.stopped and live.button.disabled
+
+
+@pytest.fixture
+def trainer(tmp_path, clips):
+    held_out = [t3d.load_clip(clips[0])]
+    return Trainer(tmp_path / "run", recipe(), clips, held_out)
+
+
+def test_training_watched_goes_to_the_end(trainer):
+    lines = train_live(trainer, minutes=5, every=0)
+    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
+    assert sum("val_APD3D_none" in line for line in lines) == 2
+    assert (trainer.journal.folder / "weights.safetensors").exists()
+
+
+def test_what_was_stopped_goes_on(trainer, monkeypatch):
+    monkeypatch.setattr(LivePlot, "stopped", property(lambda live: len(live.lines) >= 3))
+    assert len(train_live(trainer, minutes=5)) == 3
+    assert (trainer.journal.folder / "checkpoint.pt").exists()
+    assert len(train_live(trainer, minutes=0)) == 4  # the button, and the time: each after one more step
+    monkeypatch.undo()
+    assert [line["step"] for line in train_live(trainer, minutes=5)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_interrupting_the_kernel_stops_between_two_steps(trainer, monkeypatch):
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(LivePlot, "watch", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+    train_live(trainer, minutes=5)
+    assert trainer.step == 1 and signal.getsignal(signal.SIGINT) is before
+    assert len((trainer.journal.folder / "log.jsonl").read_text().splitlines()) == 1
+
+
+def test_steps_fit_the_time(monkeypatch, clips):
+    class Fake:
+        def __init__(self, folder, config, paths, device):
+            assert len(paths) == 2 and config.validation == 0
+            self.config = config
+
+        def run(self, watch, progress):
+            seconds = 0.0
+            for i in range(self.config.total):
+                first = i < self.config.matching_steps
+                warm = i % self.config.steps < 3  # not to be counted
+                seconds += 50 if warm else 0.1 if first else 0.5
+                watch({"stage": "matching" if first else "tracking", "seconds": seconds})
+
+    monkeypatch.setattr(plan, "Trainer", Fake)
+    fitted = fit_to_time(recipe(), [*clips, "more"], seconds=100, matching=0.2)
+    assert (fitted.matching_steps, fitted.steps) == (200, 160)
+    assert fit_to_time(recipe(), clips, seconds=100, matching=0).total == 200
+    assert fit_to_time(recipe(), clips, seconds=0.01).total == 2
+    for wrong in ({"seconds": 0}, {"seconds": 1, "matching": 1.0}):
+        with pytest.raises(ValueError, match="fit_to_time"):
+            fit_to_time(recipe(), clips, **wrong)
+
+
+def test_steps_are_timed_for_real(clips):
+    fitted = fit_to_time(recipe(), clips, seconds=2, probe=1)
+    assert fitted.steps >= 1 and json.dumps(fitted.to_dict())
+
+
+def test_the_chain_watches_what_autograd_holds():
+    one, two = (saving(Chain(np.random.default_rng(0), 5)), plain(Chain(np.random.default_rng(0), 5)))
+    for a, b in zip(one[:2], two[:2], strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+    assert (one[2:], two[2:]) == ((1, 1), (5, 1))
+
+
+def test_every_augmentation_has_its_two_pictures():
+    clip = t3d.simulate_clip(seed=4, frames=6, size=(32, 32), tracks=30)
+    figure = before_and_after(clip, frame=2)
+    titles = [ax.get_title() for ax in figure.axes]
+    assert [t for t in titles if t] == [f"{name}: {w}" for name in TITLES.values() for w in ("before", "after")]
+    shown = {t: ax for t, ax in zip(titles, figure.axes, strict=True) if t}
+    for name in ("colour jitter", "mirrored in x", "backward in time"):
+        before, after = (np.asarray(shown[f"{name}: {w}"].images[0].get_array()) for w in ("before", "after"))
+        same = {"mirrored in x": before[:, ::-1], "backward in time": before}.get(name)
+        assert (same is None and not np.array_equal(before, after)) or np.array_equal(same, after)
+    with pytest.raises(ValueError, match="frame"):
+        before_and_after(clip, frame=6)
+
+
+def test_paths_are_drawn_in_three_coordinates():
+    clip = t3d.simulate_clip(seed=4, frames=6, size=(32, 32), tracks=60, camera="handheld")
+    world, camera, moved, turn = motion_paths(clip, still=3, moving=2).axes
+    assert [len(ax.lines) for ax in (world, camera, moved)] == [10, 10, 10]
+    still = world.lines[0].get_xydata()
+    assert np.ptp(still, 0).max() < 1e-5 < np.ptp(camera.lines[0].get_xydata(), 0).max()
+    assert len(turn.lines) == 2 and len(turn.lines[0].get_xdata()) == 5
