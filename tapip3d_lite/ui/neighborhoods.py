@@ -149,9 +149,9 @@ def neighborhoods_3d(
     figure.update_layout(
         scene=axes | {"aspectmode": "data", "camera": view},
         height=460,
-        margin={"l": 0, "r": 0, "t": 10, "b": 0},
+        margin={"l": 0, "r": 0, "t": 34, "b": 0},
         uirevision="keep",
-        sliders=[{"steps": steps_of_k, "currentvalue": {"prefix": "K = "}}],
+        sliders=[{"steps": steps_of_k, "currentvalue": {"prefix": "K = "}, "pad": {"t": 4, "b": 24}}],
     )
     return figure
 
