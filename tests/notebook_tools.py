@@ -20,7 +20,7 @@ def notebooks():
     return sorted(FOLDER.glob("[0-9][0-9]_*.ipynb"))
 
 
-def run(nb, folder=FOLDER, timeout=300):
+def run(nb, folder=FOLDER, timeout=1200):
     """Execute a notebook in place; raises at the first cell that fails."""
     place = {"metadata": {"path": str(folder)}}
     # The kernel cuts printed text by the clock; joined, it is the same in every run.
