@@ -7,6 +7,7 @@ import torch
 import tapip3d_lite as t3d
 from tapip3d_lite.ui.exercises import EXERCISES
 from tapip3d_lite.ui.exercises.core import Exercise, Mistake, compare, judge
+from tests.exercise_matrix import table
 
 MISTAKES = [(name, mistake.name) for name, exercise in EXERCISES.items() for mistake in exercise.mistakes]
 
@@ -37,6 +38,13 @@ def test_a_stub_is_not_an_error(name):
 
     for stub in (lambda *_: None, lambda *_: ..., raising):
         assert t3d.exercises.check(name, stub).status == "not attempted"
+
+
+def test_the_matrix_tells_every_answer_with_its_hint():
+    lines = table()[2:]
+    assert len(lines) == len(EXERCISES) + len(MISTAKES)
+    assert sum("| the reference | passed |" in line for line in lines) == len(EXERCISES)
+    assert sum("| wrong |" in line and "NOT ITS OWN" not in line for line in lines) == len(MISTAKES)
 
 
 @pytest.fixture
