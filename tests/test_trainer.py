@@ -12,10 +12,12 @@ import torch
 
 import tapip3d_lite as t3d
 from tapip3d_lite.simulate import simulate_dataset
+from tapip3d_lite.training.augment import AugmentConfig
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.journal import read_log
+from tapip3d_lite.training.matching import MatchingConfig, draw_pair
 from tapip3d_lite.training.motion import MotionConfig
-from tapip3d_lite.training.sampling import SamplingConfig
+from tapip3d_lite.training.sampling import SamplingConfig, load_part
 from tapip3d_lite.training.trainer import Trainer
 
 SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
@@ -181,3 +183,56 @@ def test_a_folder_holds_one_recipe(tmp_path, clips):
 def test_recipes_that_cannot_work(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         recipe(**wrong)
+
+
+def test_the_papers_recipe_takes_a_tiny_step(tmp_path, clips):
+    paper = TrainConfig.recipe("paper")
+    assert (paper.lr, paper.clip_norm, paper.iterations, paper.frames) == (5e-4, 10.0, (4, 4), (24, 24))
+    assert paper.augment and paper.tracker_config().image_size == (384, 512)
+    sizes = SIZES | {"image_size": (32, 48)}  # clips are 32x32: they are brought to the tracker's size
+    small = {"tracker": sizes, "frames": (6, 6), "sampling": SamplingConfig(tracks=12), "validation": 0}
+    trainer = Trainer(tmp_path, TrainConfig.recipe("paper", **small, matching_steps=1, steps=1), clips)
+    before = {name: p.clone() for name, p in trainer.tracker.named_parameters()}
+    assert trainer.run(progress=False)
+    matching, tracking = read_log(tmp_path)
+    assert matching["right"] is not None and tracking["loss"] > 0 and trainer.draw(1, 0)[0].size == (32, 48)
+    changed = {name.split(".")[0] for name, p in trainer.tracker.named_parameters() if not torch.equal(p, before[name])}
+    assert {"encoder", "updater"} <= changed
+
+
+def test_augmentation_changes_what_is_drawn_only_where_it_is_asked_for(tmp_path, clips):
+    options = {"train_encoder": True, "matching_steps": 0}
+    plain = Trainer(tmp_path / "plain", recipe(**options), clips)
+    changed = Trainer(tmp_path / "changed", recipe(**options, augment=True), clips)
+    different = [not np.array_equal(plain.draw(s, 0)[0].depths, changed.draw(s, 0)[0].depths) for s in range(8)]
+    assert sum(different) >= 7
+    path, index = clips[0], np.arange(4)
+    whole = t3d.load_clip(path)
+    part = load_part(path, lambda available: index)
+    assert np.array_equal(part.video, whole.video[:4])
+    with pytest.raises(ValueError, match="train_encoder"):
+        recipe(augment=True)
+
+
+@pytest.mark.parametrize("augmentation", [None, AugmentConfig(), AugmentConfig(flip_x=1, flip_y=1)])
+def test_pairs_show_the_same_point_twice(clips, augmentation):
+    """Both places of a point show its surface: their colours agree better than those of shuffled points."""
+    matched, shuffled = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        pair = draw_pair(clips[seed % 3], rng, MatchingConfig(gap=2, jitter=0.0), (64, 64), augmentation)
+        assert pair.rgb.shape == (2, 3, 64, 64) and len(pair.uv[0]) >= 1
+        u, v = pair.uv.round().long().clamp(0, 63).unbind(-1)
+        colours = [pair.rgb[i, :, v[i], u[i]].T for i in range(2)]
+        matched.append(float((colours[0] - colours[1]).abs().mean()))
+        shuffled.append(float((colours[0] - colours[1][torch.from_numpy(rng.permutation(len(u[0])))]).abs().mean()))
+    assert np.mean(matched) < 0.6 * np.mean(shuffled)
+
+
+def test_a_recipe_from_before_a_setting_existed_is_continued(tmp_path, clips):
+    Trainer(tmp_path, recipe(), clips)
+    stored = json.loads((tmp_path / "config.json").read_text())
+    del stored["augment"], stored["augmentation"], stored["motion"]["smoothing"]
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    assert TrainConfig.from_dict(stored).motion == recipe().motion and not TrainConfig.from_dict(stored).augment
+    assert Trainer(tmp_path, recipe(), clips, resume=True).step == 0

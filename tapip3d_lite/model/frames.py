@@ -83,9 +83,13 @@ def frames_from_clip(clip: Clip, size: tuple[int, int] | None = None, device: to
         device: where the tensors go.
     """
     clip = clip if size is None else resize_clip(clip, size)
-    rgb = torch.from_numpy(clip.video).to(device).movedim(-1, 1).float() / 255
-    others = (torch.from_numpy(x).to(device)[None] for x in (clip.depths, clip.intrinsics, clip.extrinsics))
+    rgb = _tensor(clip.video).to(device).movedim(-1, 1).float() / 255
+    others = (_tensor(x).to(device)[None] for x in (clip.depths, clip.intrinsics, clip.extrinsics))
     return Frames(rgb[None], *others)
+
+
+def _tensor(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array))  # a mirrored clip's strides are negative
 
 
 def resize_clip(clip: Clip, size: tuple[int, int]) -> Clip:

@@ -1,6 +1,7 @@
 """`augment`: every change that the paper makes to a training clip's images, each with its own probability.
 
-Paper: appendix (training). Coordinates are moved separately (`motion`), points are drawn afterwards (`sampling`).
+Paper: appendix (training). Playing backward and drawing points are `sampling`'s, moving coordinates is `motion`'s; they
+also serve trainings whose features are kept, which images that change would make useless.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.training.appearance import blur_colors, blur_depth, erase, jitter_colors
-from tapip3d_lite.training.reframing import flip_time, flip_x, flip_y, random_view, reframe
+from tapip3d_lite.training.reframing import flip_x, flip_y, random_view, reframe
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class AugmentConfig:
             is less than a pixel at a width of 128).
         reframe: share that is padded (each side by at most `pad`), resized (by a factor within `scale`) and cropped
             to the old size at a place that wanders by at most `drift` a frame.
-        flip_x, flip_y, flip_time: shares that are mirrored, and played backward.
+        flip_x, flip_y: shares that are mirrored.
 
     Raises:
         ValueError: a share outside [0, 1], or a range that is negative or not in order.
@@ -49,10 +50,9 @@ class AugmentConfig:
     drift: float = 15 / 512
     flip_x: float = 0.5
     flip_y: float = 0.5
-    flip_time: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("erase", "jitter", "blur", "depth_blur", "reframe", "flip_x", "flip_y", "flip_time"):
+        for name in ("erase", "jitter", "blur", "depth_blur", "reframe", "flip_x", "flip_y"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"AugmentConfig.{name}: expected a share in [0, 1], got {getattr(self, name)}")
         for name in ("erase_side", "blur_sigma", "depth_blur_sigma", "scale", "jitter_strength"):
@@ -85,7 +85,6 @@ def augmentations(config: AugmentConfig) -> dict[str, tuple[float, Callable[[Cli
         ),
         "flip_x": (config.flip_x, lambda clip, rng: flip_x(clip)),
         "flip_y": (config.flip_y, lambda clip, rng: flip_y(clip)),
-        "flip_time": (config.flip_time, lambda clip, rng: flip_time(clip)),
     }
 
 

@@ -40,14 +40,15 @@ def train(
     if resume and recipe.exists():
         config = TrainConfig.from_dict(json.loads(recipe.read_text()))
     data = Path(out) / "clips" if data is None else Path(data)
+    large = config.tracker_config().image_size > (128, 128)
     with _processes(device) as leads:
         progress = progress and leads
         if leads:
-            clips = training_clips(data / "train", config.clips, progress)
+            clips = training_clips(data / "train", config.clips, progress, large=large)
             held_out = validation_clips(data / "validation", config.validation, progress) if config.validation else []
         _wait()
         if not leads:
-            clips, held_out = training_clips(data / "train", config.clips, False), []
+            clips, held_out = training_clips(data / "train", config.clips, False, large=large), []
         trainer = Trainer(out, config, clips, held_out, device, resume)
         with interruptible() as stop:
             finished = trainer.run(stop, progress=progress)

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.training.augment import AugmentConfig
 from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.matching import MatchingConfig
 from tapip3d_lite.training.motion import MotionConfig
@@ -14,7 +15,7 @@ from tapip3d_lite.training.sampling import SamplingConfig
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """What is trained, on what, and how long. Defaults are the `lite` recipe for two CPU cores.
+    """What is trained, on what, and how long. Defaults are the `lite` recipe for two CPU cores; see also `recipe`.
 
     Attributes:
         preset: of the tracker, `"lite"` or `"paper"`.
@@ -34,6 +35,8 @@ class TrainConfig:
         seed: of everything that is drawn.
         evaluate_every, validation: steps between evaluations, and on how many held-out clips.
         save_every: steps between checkpoints.
+        augment: change the images of both stages as `augmentation` says, each time anew; the encoder must then be
+            trained along, since kept features would not follow.
 
     Raises:
         ValueError: a value that cannot work.
@@ -59,10 +62,12 @@ class TrainConfig:
     evaluate_every: int = 1000
     validation: int = 8
     save_every: int = 250
+    augment: bool = False
     loss: LossConfig = field(default_factory=lambda: LossConfig(visibility=0.5))
     motion: MotionConfig = field(default_factory=MotionConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
+    augmentation: AugmentConfig = field(default_factory=AugmentConfig)
 
     def __post_init__(self) -> None:
         for name in ("frames", "iterations"):
@@ -79,9 +84,43 @@ class TrainConfig:
             raise ValueError(f'TrainConfig.precision: expected "float32" or "bfloat16", got {self.precision!r}')
         if self.lr <= 0 or not 0 < self.warmup < 1 or not 0 <= self.short <= 1:
             raise ValueError("TrainConfig: lr must be positive, warmup in (0, 1), short in [0, 1]")
+        if self.augment and not self.train_encoder:
+            raise ValueError(
+                "TrainConfig.augment: features of a frozen encoder are kept in files and cannot follow changed images; "
+                "set train_encoder=True, or augment=False"
+            )
         half = self.tracker_config().window // 2
         if min(self.frames) <= half:
             raise ValueError(f"TrainConfig.frames: expected more than half a window ({half}), got {self.frames}")
+
+    @classmethod
+    def recipe(cls, preset: str = "lite", **changes: Any) -> TrainConfig:
+        """The recipe of a preset: `"lite"` (the defaults), or `"paper"`.
+
+        Paper: section 4 and appendix; meant for 8 processes with a GPU each. Batches, clips and the visibility weight
+        are the paper's; instead of CoTracker3's encoder it starts from our matching stage, and its clips are simulated.
+
+        Args:
+            preset: `"lite"` or `"paper"`.
+            changes: fields to set differently.
+        """
+        paper = {
+            "clips": 10_000,
+            "steps": 200_000,
+            "frames": (24, 24),  # two windows
+            "iterations": (4, 4),
+            "short": 0.0,
+            "train_encoder": True,
+            "augment": True,
+            "lr": 5e-4,
+            "precision": "bfloat16",
+            "evaluate_every": 5000,
+            "save_every": 1000,
+            "loss": LossConfig(form="paper", visibility=3.0),
+            "motion": MotionConfig(world=0.0, turned=0.0, still=0.0, rotation=0.1, rotation_noise=0.05),
+            "sampling": SamplingConfig(tracks=384),
+        }
+        return cls(**({"preset": preset} | (paper if preset == "paper" else {}) | changes))
 
     def tracker_config(self) -> TrackerConfig:
         """What is trained."""
@@ -98,7 +137,7 @@ class TrainConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainConfig:
-        """The inverse of `to_dict`.
+        """The inverse of `to_dict`; what an older file lacks has its default.
 
         Raises:
             ValueError: unknown names.
@@ -106,5 +145,6 @@ class TrainConfig:
         unknown = set(values) - {f.name for f in fields(cls)}
         if unknown:
             raise ValueError(f"TrainConfig: unknown {', '.join(sorted(unknown))}; was it written by another version?")
-        parts = {"loss": LossConfig, "motion": MotionConfig, "sampling": SamplingConfig, "matching": MatchingConfig}
+        parts: dict[str, type] = {"loss": LossConfig, "motion": MotionConfig, "sampling": SamplingConfig}
+        parts |= {"matching": MatchingConfig, "augmentation": AugmentConfig}
         return cls(**{k: parts[k](**v) if k in parts else v for k, v in values.items()})

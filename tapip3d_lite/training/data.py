@@ -6,7 +6,7 @@ run that is continued draws what it would have drawn.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from tapip3d_lite.clip import Clip, load_clip
 from tapip3d_lite.files import atomic_path
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.encoder import Encoder
-from tapip3d_lite.model.frames import Frames, frames_from_clip
+from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
 from tapip3d_lite.simulate.seeds import TRAINING, VALIDATION
 from tapip3d_lite.training.loss import Truth
@@ -41,11 +41,19 @@ def training_config(seed: int) -> SimulationConfig:
     )
 
 
-def training_clips(folder: str | Path, count: int, progress: bool = True, workers: int | None = None) -> list[Path]:
-    """The paths of the first `count` training clips; those that are missing are simulated."""
+def large_training_config(seed: int) -> SimulationConfig:
+    """The same clip at the size of the paper's model, with more points."""
+    return replace(training_config(seed), size=(384, 512), tracks=768)
+
+
+def training_clips(
+    folder: str | Path, count: int, progress: bool = True, workers: int | None = None, large: bool = False
+) -> list[Path]:
+    """The paths of the first `count` training clips, 128x128 or `large`; those that are missing are simulated."""
     if not 0 < count <= len(TRAINING):
         raise ValueError(f"training_clips: count must be in [1, {len(TRAINING)}], got {count}")
-    return simulate_dataset(folder, count, training_config, TRAINING.start, workers, progress)
+    config = large_training_config if large else training_config
+    return simulate_dataset(folder, count, config, TRAINING.start, workers, progress)
 
 
 def validation_clips(folder: str | Path, count: int, progress: bool = True) -> list[Clip]:
@@ -119,8 +127,8 @@ def make_batch(clips: list[Clip], features: list[Tensor] | None = None) -> Batch
 class FeatureCache:
     """Features of whole clips by a frozen encoder, as half floats in files that are made when first asked for."""
 
-    def __init__(self, folder: str | Path, encoder: Encoder) -> None:
-        self.folder, self.encoder = Path(folder), encoder
+    def __init__(self, folder: str | Path, encoder: Encoder, size: tuple[int, int]) -> None:
+        self.folder, self.encoder, self.size = Path(folder), encoder, size
 
     @torch.no_grad()
     def path(self, clip: Path) -> Path:
@@ -128,7 +136,8 @@ class FeatureCache:
         path = self.folder / f"{clip.stem}.npy"
         if not path.exists():
             device = next(self.encoder.parameters()).device
-            features = self.encoder(frames_from_clip(load_clip(clip, points=False), device=device).rgb)[0]
+            frames = frames_from_clip(resize_clip(load_clip(clip, points=False), self.size), device=device)
+            features = self.encoder(frames.rgb)[0]
             with atomic_path(path) as temporary:
                 np.save(temporary, features.half().cpu().numpy())
         return path

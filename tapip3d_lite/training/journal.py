@@ -33,7 +33,7 @@ class Journal:
         recipe = self.folder / "config.json"
         wanted = json.loads(json.dumps(config.to_dict()))
         if recipe.exists():
-            stored = json.loads(recipe.read_text())
+            stored = json.loads(json.dumps(TrainConfig.from_dict(json.loads(recipe.read_text())).to_dict()))
             different = [f"{k}={stored.get(k)!r} (now {wanted.get(k)!r})" for k in wanted if stored.get(k) != wanted[k]]
             if not resume:
                 raise ValueError(

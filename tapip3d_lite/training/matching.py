@@ -17,7 +17,10 @@ from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import project
+from tapip3d_lite.training.augment import AugmentConfig, augment
 from tapip3d_lite.training.sampling import load_part
+
+_ENOUGH = 16  # points that two frames should share
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class MatchingConfig:
         gap: greatest number of frames between the two.
         levels: pyramid levels at which features are compared, each weighing a third of the one before.
         spread: standard deviation of the target around the true place, in cells.
-        jitter: strength of random brightness and contrast, drawn for each frame.
+        jitter: strength of random brightness and contrast, drawn for each frame (without augmentation).
         lr, weight_decay, clip_norm: of AdamW with one cycle.
     """
 
@@ -60,24 +63,50 @@ class Pair:
         return Pair(self.rgb.to(device), self.uv.to(device))
 
 
-def draw_pair(path: str | Path, rng: np.random.Generator, config: MatchingConfig) -> Pair:
-    """Two random frames of a clip with points that both show, mirrored and re-coloured at random."""
-    clip, points = _two_frames(path, rng, config.gap)
+def draw_pair(
+    path: str | Path,
+    rng: np.random.Generator,
+    config: MatchingConfig,
+    size: tuple[int, int] | None = None,
+    augmentation: AugmentConfig | None = None,
+) -> Pair:
+    """Two random frames of a clip with points that both show, changed at random.
+
+    Args:
+        path: an npz with tracks.
+        rng: source of chance.
+        config: how far apart the frames may be, and how many points.
+        size: (H, W) wanted; None: as stored.
+        augmentation: changes the frames as the tracker's training does, where enough points remain; None: they are
+            only mirrored and re-coloured by `jitter`.
+    """
+    clip, points = _two_frames(path, rng, config.gap, size)
+    if augmentation is not None:
+        changed = augment(clip, rng, augmentation)
+        left = np.flatnonzero(changed.tracks.visible.all(0))
+        clip, points = (changed, left) if len(left) >= min(_ENOUGH, len(points)) else (clip, points)
     chosen = rng.permutation(points)[: config.points]
     uv = project(clip.tracks.xyz[:, chosen], clip.intrinsics, clip.extrinsics)[0].astype(np.float32)
-    video = clip.video
-    for axis in (0, 1):  # u, v
-        if rng.random() < 0.5:
-            uv[..., axis] = clip.size[1 - axis] - 1 - uv[..., axis]
-            video = np.flip(video, 2 - axis)
-    rgb = np.ascontiguousarray(video.transpose(0, 3, 1, 2)).astype(np.float32) / 255
-    contrast = 1 + config.jitter * rng.uniform(-1, 1, (2, 3, 1, 1)) * (rng.random((2, 1, 1, 1)) < 0.5)
-    brightness = 0.25 * config.jitter * rng.uniform(-1, 1, (2, 1, 1, 1))
-    rgb = np.clip(rgb * contrast + brightness, 0, 1).astype(np.float32)
+    rgb = np.ascontiguousarray(clip.video.transpose(0, 3, 1, 2)).astype(np.float32) / 255
+    if augmentation is None:
+        rgb, uv = _vary(rgb, uv, rng, config.jitter)
     return Pair(torch.from_numpy(rgb), torch.from_numpy(uv))
 
 
-def _two_frames(path: str | Path, rng: np.random.Generator, gap: int) -> tuple[Clip, np.ndarray]:
+def _vary(rgb: np.ndarray, uv: np.ndarray, rng: np.random.Generator, jitter: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mirror both frames alike and change each one's brightness and contrast: light enough for every step on a CPU."""
+    for axis in (0, 1):  # u, v
+        if rng.random() < 0.5:
+            uv[..., axis] = rgb.shape[3 - axis] - 1 - uv[..., axis]
+            rgb = np.flip(rgb, 3 - axis)
+    contrast = 1 + jitter * rng.uniform(-1, 1, (2, 3, 1, 1)) * (rng.random((2, 1, 1, 1)) < 0.5)
+    brightness = 0.25 * jitter * rng.uniform(-1, 1, (2, 1, 1, 1))
+    return np.clip(rgb * contrast + brightness, 0, 1).astype(np.float32), uv
+
+
+def _two_frames(
+    path: str | Path, rng: np.random.Generator, gap: int, size: tuple[int, int] | None
+) -> tuple[Clip, np.ndarray]:
     """Frames at most `gap` apart, nearer ones where these share too few points, and the points that both show."""
 
     def choose(available: int) -> np.ndarray:
@@ -86,9 +115,9 @@ def _two_frames(path: str | Path, rng: np.random.Generator, gap: int) -> tuple[C
         return rng.permutation([first, first + distance])
 
     while True:
-        clip = load_part(path, choose)
+        clip = load_part(path, choose, size=size)
         both = np.flatnonzero(clip.tracks.visible.all(0))
-        if len(both) >= 16 or gap == 1:
+        if len(both) >= _ENOUGH or gap == 1:
             return clip, both
         gap = max(gap // 2, 1)
 

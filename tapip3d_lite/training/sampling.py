@@ -14,6 +14,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.files import load_npz
+from tapip3d_lite.model.frames import resize_clip
 
 
 @dataclass(frozen=True)
@@ -86,13 +87,16 @@ def sample_tracks(clip: Clip, rng: np.random.Generator, config: SamplingConfig) 
     return replace(clip, queries=queries, tracks=replace(picked, queries=queries))
 
 
-def load_part(path: str | Path, choose: Callable[[int], np.ndarray], colours: bool = True) -> Clip:
+def load_part(
+    path: str | Path, choose: Callable[[int], np.ndarray], colours: bool = True, size: tuple[int, int] | None = None
+) -> Clip:
     """Some frames of a stored clip, with every track that they show, asked for at the first frame that shows it.
 
     Args:
         path: an npz with tracks.
         choose: from the number of frames in the file to the indices (T,) of those wanted, in any order.
         colours: False leaves the video black, and does not read it.
+        size: (H, W) of the result; None: as stored.
     """
     arrays = load_npz(path, skip=() if colours else ("video",))
     index = choose(len(arrays["depths"]))
@@ -104,4 +108,8 @@ def load_part(path: str | Path, choose: Callable[[int], np.ndarray], colours: bo
     queries = query_rows(xyz, visible, visible.argmax(0))
     dynamic = arrays["dynamic"][kept] if "dynamic" in arrays else None
     tracks = Tracks(xyz, visible, queries, dynamic=dynamic)
-    return Clip(video, **frames, queries=queries, tracks=tracks, name=str(arrays["name"]), fps=float(arrays["fps"]))
+    clip = Clip(video, **frames, queries=queries, tracks=tracks, name=str(arrays["name"]), fps=float(arrays["fps"]))
+    if size in (None, clip.size):
+        return clip
+    resized = resize_clip(clip, size)
+    return replace(clip, video=resized.video, depths=resized.depths, intrinsics=resized.intrinsics, extras={})

@@ -17,6 +17,7 @@ from torch import nn
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
+from tapip3d_lite.training.augment import augment
 from tapip3d_lite.training.backward import saving_backward
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.data import Batch, FeatureCache, make_batch
@@ -54,7 +55,7 @@ class Trainer:
         Args:
             folder: made if missing.
             config: the whole recipe.
-            clips: training clips (npz with tracks), at the tracker's image size.
+            clips: training clips (npz with tracks) of any image size.
             validation: held-out clips.
             device: `"cpu"` or `"cuda"`.
             resume: continue from the folder's checkpoint, if there is one.
@@ -65,13 +66,14 @@ class Trainer:
         if not clips:
             raise ValueError("Trainer: no training clips; make some with `training_clips` or `simulate`")
         self.config, self.clips, self.validation, self.device = config, list(clips), list(validation), device
+        self.size = config.tracker_config().image_size
         self.journal = Journal(folder, config, resume)
         with torch.random.fork_rng():  # the caller's chance is not ours
             torch.manual_seed(config.seed)
             self.tracker = Tracker(config.tracker_config()).to(device).train()
             nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
         self.group, self.step, self.seconds = Group(), 0, 0.0
-        self.cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder)
+        self.cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, self.size)
         saved = self.journal.checkpoint(device)
         if saved is not None:
             self.tracker.load_state_dict(saved["model"])
@@ -149,8 +151,10 @@ class Trainer:
             chosen = draw_frames(rng, available, wanted, config.sampling.backward)
             return chosen
 
-        clip = sample_tracks(load_part(path, choose, config.train_encoder), rng, config.sampling)
-        clip = random_coordinates(clip, rng, config.motion)
+        clip = load_part(path, choose, config.train_encoder, self.size)
+        if config.augment:
+            clip = augment(clip, rng, config.augmentation)
+        clip = random_coordinates(sample_tracks(clip, rng, config.sampling), rng, config.motion)
         return clip, None if config.train_encoder else self.cache.frames(path, chosen)
 
     def batch(self, step: int) -> Batch:
@@ -184,7 +188,8 @@ class Trainer:
 
     def _match(self) -> dict:
         rng = np.random.default_rng([self.config.seed, self.step, self.group.rank])
-        pair = draw_pair(self.clips[rng.integers(len(self.clips))], rng, self.config.matching)
+        path, augmentation = self.clips[rng.integers(len(self.clips))], self.config.augmentation
+        pair = draw_pair(path, rng, self.config.matching, self.size, augmentation if self.config.augment else None)
         self._drawn = {"rgb": pair.rgb, "uv": pair.uv}
         loss, right = matching_loss(self.tracker.encoder, pair.to(self.device), self.config.matching)
         loss.backward()

@@ -13,6 +13,7 @@ from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import invert, project
 from tapip3d_lite.training.augment import AugmentConfig, augmentations
 from tapip3d_lite.training.motion import MotionConfig, move, smooth_motion
+from tapip3d_lite.training.reframing import flip_time
 from tapip3d_lite.ui.figures2d import INK, _image, _plot, check_drawable
 from tapip3d_lite.ui.motion import MOVING, STILL
 
@@ -45,11 +46,12 @@ def before_and_after(clip: Clip, seed: int = 0, frame: int = 0, config: AugmentC
     check_drawable(clip, frame=frame)
     if clip.tracks is None:
         raise ValueError(f"before_and_after: clip {clip.name!r} has no true tracks; simulate one")
-    changes = augmentations(_strong(config or AugmentConfig()))
+    changes = {name: change for name, (_, change) in augmentations(_strong(config or AugmentConfig())).items()}
+    changes["flip_time"] = lambda clip, rng: flip_time(clip)  # drawn by `sampling`
     figure = Figure(figsize=(12.4, 0.92 * len(changes)), layout="constrained")
     cells = figure.subplots((len(changes) + 1) // 2, 8).reshape(-1, 4)
     far = float(np.quantile(clip.depths[clip.depths > 0], 0.95))
-    for row, (name, (_, change)) in zip(cells, changes.items(), strict=True):
+    for row, (name, change) in zip(cells, changes.items(), strict=True):
         changed = change(clip, np.random.default_rng(seed))
         at = len(clip) - 1 - frame if name == "flip_time" else frame
         detail = _edge(clip.depths[frame]) if "blur" in name else None
