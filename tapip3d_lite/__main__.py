@@ -5,7 +5,10 @@ Bad input ends with one line on standard error and exit code 2; Ctrl-C with exit
 
 from __future__ import annotations
 
+import argparse
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -137,7 +140,7 @@ def train(
     resume: Annotated[bool, arg(help="continue from the folder's checkpoint, with its recipe")] = False,
     device: Annotated[str, arg(help="cpu or cuda; several processes: torchrun -m tapip3d_lite train …")] = "cpu",
 ) -> None:
-    """Train a tracker on simulated clips; Ctrl-C saves and stops, --resume goes on exactly there."""
+    """Train a tracker on simulated clips, by default by the recipe of --preset (lite or paper); Ctrl-C saves and stops, --resume goes on exactly there."""
     from tapip3d_lite.training.command import train as run
 
     try:
@@ -147,6 +150,25 @@ def train(
     print(text)
     if not finished:
         sys.exit(130)
+
+
+def card(
+    folder: Positional[Path],
+    results: Positional[Path],
+    /,
+    hardware: Annotated[str, arg(help="what it was trained on, in words")],
+    out: Annotated[Path, arg(help="Markdown file")] = Path("MODEL_CARD.md"),
+    name: Annotated[str, arg(help="of the model")] = "lite",
+    weights: Annotated[Path | None, arg(help="the file, if not the folder's own")] = None,
+) -> None:
+    """Write the model card of a training folder and of results that `benchmark --out` wrote."""
+    from tapip3d_lite.files import atomic_path
+    from tapip3d_lite.training.card import model_card
+
+    text = model_card(folder, results, hardware, name, weights=weights)
+    with atomic_path(out) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(f"wrote {out}")
 
 
 def samples(out: Path = Path("data_samples")) -> None:
@@ -238,6 +260,7 @@ COMMANDS = {
     "simulate": simulate,
     "samples": samples,
     "train": train,
+    "card": card,
     "import": import_,
     "picture": picture,
     "bench": bench,
@@ -246,10 +269,18 @@ COMMANDS = {
 }
 
 
+def _train(arguments: list[str]) -> Callable[..., None]:
+    """`train` with the defaults of the recipe that `--preset` names."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--preset", default="lite")
+    return partial(train, config=TrainConfig.recipe(parser.parse_known_args(arguments)[0].preset))
+
+
 def main() -> None:
     """Run one command; what the user can mend is one line and exit code 2."""
     try:
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="tapip3d_lite", description=__doc__.splitlines()[0])
+        commands = COMMANDS | {"train": _train(sys.argv[1:])}
+        tyro.extras.subcommand_cli_from_dict(commands, prog="tapip3d_lite", description=__doc__.splitlines()[0])
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -1,0 +1,145 @@
+"""A model card from the files of a training: every number in it is read from one of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, load_results, summary_table
+from tapip3d_lite.model.weights import load_weights
+from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.journal import read_log
+
+_LIMITS = """- Trained on simulated clips of rigid bodies in rooms, at most {frames} frames an example and images of {height}x{width}
+  pixels; on real footage, soft bodies or much longer clips this card measures nothing.
+- It expects metric or at least consistent depth, and poses; `check` finds the usual mix-ups.
+- Nothing is remembered beyond a window ({window} frames) but the estimate: a point hidden for longer may be lost.
+- Scores are means over few clips each: read the intervals, not the third decimal."""
+
+
+def model_card(
+    folder: str | Path,
+    results: str | Path,
+    hardware: str,
+    name: str = "lite",
+    command: str | None = None,
+    weights: str | Path | None = None,
+) -> str:
+    """The model card of a finished training, in Markdown.
+
+    Args:
+        folder: of the training: `config.json`, `log.jsonl`, `weights.safetensors`.
+        results: JSON that `benchmark --out` wrote.
+        hardware: what it was trained on, in words; files cannot know.
+        name: what the model is called.
+        command: that made it; None: the one that the recipe amounts to.
+        weights: the file, if not the folder's own.
+
+    Returns:
+        The text.
+
+    Raises:
+        ValueError: a file is missing or unreadable, the log is empty, or there are no results.
+    """
+    folder = Path(folder)
+    path = Path(weights) if weights else folder / "weights.safetensors"
+    if not (folder / "config.json").exists() or not path.exists():
+        raise ValueError(f"card: {folder} is not a finished training; it needs config.json, log.jsonl and {path.name}")
+    config = TrainConfig.from_dict(json.loads((folder / "config.json").read_text(encoding="utf-8")))
+    log, (scores, _) = read_log(folder), load_results(results)
+    if not log or not scores:
+        raise ValueError(
+            f"card: expected steps in {folder / 'log.jsonl'} and scores in {results}; one of them is empty"
+        )
+    command = command or f"python -m tapip3d_lite train --out {folder}{_flags(config)}"
+    compared = [label for label in scores if any(split in scores[label] for split in SPLITS)]
+    parts = [
+        f"# Model card: `{name}`",
+        _facts(config, log, path, hardware),
+        f"## Made by\n\n```\n{command}\npython -m tapip3d_lite benchmark --tracker {_trackers(compared)} "
+        f"--space world camera --out {Path(results).name}\n```",
+        "## Scores\n\nMeans with 95 % bootstrap intervals over clips of the Lite benchmark, whose seeds no training can draw.",
+        *(f"{title}:\n\n{_table(scores, part)}" for title, part in _PARTS.items()),
+    ]
+    return "\n\n".join([*parts, f"## Limits\n\n{_limits(config)}"]) + "\n"
+
+
+_PARTS = {"All points": "", "Moving points": "_dynamic", "Points at rest": "_static"}
+
+
+def _limits(config: TrainConfig) -> str:
+    model = config.tracker_config()
+    height, width = model.image_size
+    return _LIMITS.format(frames=config.frames[1], height=height, width=width, window=model.window)
+
+
+def _table(scores: dict, part: str) -> str:
+    return summary_table(scores, tuple(metric + part for metric in METRICS))
+
+
+def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -> str:
+    model = load_weights(weights)
+    parameters = sum(p.numel() for p in model.parameters())
+    held_out = [line for line in log if "val_AJ3D_none" in line]
+    rows = {
+        "parameters": f"{parameters / 1e6:.2f} M, file {weights.stat().st_size / 1e6:.2f} MB",
+        "model": f"preset `{config.preset}`, images {model.config.image_size[0]}x{model.config.image_size[1]}, window "
+        f"{model.config.window}, K = {model.config.neighbors}, {model.config.levels} levels"
+        + (f"; set by hand: {', '.join(f'{k}={v}' for k, v in config.tracker.items())}" if config.tracker else ""),
+        "data": f"{config.clips} simulated clips; examples of {_range(config.frames)} frames and {config.sampling.tracks} "
+        f"tracks; {'augmented' if config.augment else 'images not augmented'}",
+        "steps": f"{min(log[-1]['step'], config.matching_steps)} of matching, "
+        f"{max(log[-1]['step'] - config.matching_steps, 0)} of tracking, {config.batch} clips a step and process",
+        "recipe": f"AdamW {config.lr:g}, weight decay {config.weight_decay:g}, one cycle, M = {_range(config.iterations)}, "
+        f"{config.precision}, encoder {'trained along' if config.train_encoder else 'frozen after matching'}, seed {config.seed}",
+        "wall-clock": f"{log[-1]['seconds'] / 3600:.2f} h of steps (evaluations and simulation not counted)",
+        "hardware": hardware,
+        "visible from": f"probability {model.config.visible_threshold:g}",
+    }
+    if held_out:
+        last = held_out[-1]
+        rows["held-out clips"] = (
+            f"AJ3D {last['val_AJ3D_none']:.3f}, APD3D {last['val_APD3D_none']:.3f}, OA {last['val_OA']:.3f} "
+            f"at step {last['step']} (unscaled, world, {config.validation} clips)"
+        )
+    return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+
+
+def _range(pair: tuple[int, int]) -> str:
+    return str(pair[0]) if pair[0] == pair[1] else f"{pair[0]} to {pair[1]}"
+
+
+def _trackers(labels: list[str]) -> str:
+    """Names for `--tracker`: a learnt one is labelled once a space."""
+    return " ".join(dict.fromkeys(label.rpartition(" · ")[0] or label for label in labels))
+
+
+def _flags(config: TrainConfig) -> str:
+    """What the recipe sets otherwise than its preset does, as options."""
+    default, own = TrainConfig.recipe(config.preset).to_dict(), config.to_dict()
+    flags = "" if config.preset == "lite" else f" --preset {config.preset}"
+    for name, value, usual in _leaves(own, default):
+        if value != usual and name != "tracker":  # the command line knows presets only; the table names the changes
+            flags += (
+                f" --{name.replace('_', '-')} {_words(value)}" if not isinstance(value, bool) else _switch(name, value)
+            )
+    return flags
+
+
+def _leaves(own: dict, default: dict, prefix: str = "") -> list[tuple[str, object, object]]:
+    leaves = []
+    for name, value in own.items():
+        if isinstance(value, dict) and isinstance(default.get(name), dict) and name != "tracker":
+            leaves += _leaves(value, default[name], f"{prefix}{name}.")
+        else:
+            leaves.append((prefix + name, value, default.get(name)))
+    return leaves
+
+
+def _words(value: object) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def _switch(name: str, value: bool) -> str:
+    *path, last = name.replace("_", "-").split(".")
+    return f" --{'.'.join([*path, last if value else f'no-{last}'])}"

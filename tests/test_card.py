@@ -1,0 +1,83 @@
+"""The model card repeats what the files say, and nothing else."""
+
+import json
+import shlex
+from dataclasses import replace
+
+import pytest
+import torch
+import tyro
+
+import tapip3d_lite as t3d
+from tapip3d_lite.evaluation.benchmark import SPLITS, estimate, save_results, show
+from tapip3d_lite.training.card import model_card
+from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.motion import MotionConfig
+from tests.test_trainer import SIZES, recipe
+
+METRICS = [m + part for m in ("AJ3D_none", "APD3D_none", "AJ3D", "APD3D", "OA") for part in ("", "_dynamic", "_static")]
+
+
+@pytest.fixture
+def results():
+    generator = torch.Generator().manual_seed(0)
+    labels = ("static", "klt", "lite · world", "lite · camera")
+
+    def clip():
+        return {metric: float(torch.rand((), generator=generator)) for metric in METRICS}
+
+    return {label: {split: {f"{split}-{i}": clip() for i in range(4)} for split in SPLITS} for label in labels}
+
+
+@pytest.fixture
+def folder(tmp_path, results):
+    config = recipe(lr=2e-3)
+    (tmp_path / "config.json").write_text(json.dumps(config.to_dict()))
+    lines = [{"step": s, "seconds": 450.0 * s} for s in range(1, 17)]
+    lines[-1] |= {"val_AJ3D_none": 0.4321, "val_APD3D_none": 0.5432, "val_OA": 0.6543}
+    (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **SIZES))
+    tracker.config = replace(tracker.config, visible_threshold=0.35)
+    t3d.save_weights(tracker, tmp_path / "weights.safetensors", half=True)
+    save_results(tmp_path / "bench.json", results)
+    return tmp_path
+
+
+def test_every_number_comes_from_the_files(folder, results):
+    text = model_card(folder, folder / "bench.json", "two cores of a toaster")
+    parameters = sum(p.numel() for p in t3d.load_tracker(folder / "weights.safetensors").parameters())
+    expected = [f"{parameters / 1e6:.2f} M", "two cores of a toaster", "4 of matching, 12 of tracking", "2.00 h"]
+    expected += ["probability 0.35", "AJ3D 0.432, APD3D 0.543, OA 0.654 at step 16", "AdamW 0.002", "images 32x32"]
+    expected += ["--lr 0.002", "hidden=32", "--sampling.tracks 6", "--tracker static klt lite --space world camera"]
+    assert not [x for x in expected if x not in text]
+    for label in results:
+        for split in SPLITS:
+            row = [show(estimate(results, label, split, m)) for m in ("AJ3D_none", "APD3D_none", "AJ3D", "APD3D", "OA")]
+            assert f"| {split} (4) | {label} | {' | '.join(row)} |" in text
+    changed = results | {"klt": results["static"]}
+    save_results(folder / "bench.json", changed)
+    assert model_card(folder, folder / "bench.json", "two cores of a toaster") != text
+
+
+@pytest.mark.parametrize("preset", ["lite", "paper"])
+def test_the_command_makes_the_recipe_again(folder, preset):
+    """The printed options, parsed as the command line does, give the folder's own recipe."""
+    motion = MotionConfig(world=0.25, turned=0.0)
+    config = TrainConfig.recipe(preset, frames=(12, 16), train_encoder=True, augment=preset == "lite", motion=motion)
+    (folder / "config.json").write_text(json.dumps(config.to_dict()))
+    text = model_card(folder, folder / "bench.json", "x")
+    line = next(line for line in text.splitlines() if " train " in line)
+    options = shlex.split(line.split(str(folder), 1)[1])
+    assert tyro.cli(TrainConfig, args=options, default=TrainConfig.recipe(preset)) == config
+    assert ("--augment" in options, "--no-augment" in options) == (preset == "lite", preset == "paper")
+
+
+def test_an_unfinished_training_has_no_card(folder):
+    (folder / "log.jsonl").write_text("")
+    with pytest.raises(ValueError, match="empty"):
+        model_card(folder, folder / "bench.json", "x")
+    (folder / "weights.safetensors").unlink()
+    with pytest.raises(ValueError, match="not a finished training"):
+        model_card(folder, folder / "bench.json", "x")
+    with pytest.raises(ValueError, match="card"):
+        model_card(folder / "absent", folder / "bench.json", "x")
