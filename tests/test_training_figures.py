@@ -1,8 +1,7 @@
 """Figures and live plot of notebook 06, by their state; how many steps fit into a time; the miniature chain."""
 
+import asyncio
 import json
-import os
-import signal
 
 import numpy as np
 import pytest
@@ -43,6 +42,10 @@ def lines():
     then = [{"step": 3 + i, "stage": "tracking", "seconds": 60 * (i + 1), **v} for i, v in enumerate(values)]
     then[-1] |= {"val_APD3D_none": 0.5, "val_APD3D_none_dynamic": 0.3}
     return first + then
+
+
+def watched(trainer, minutes=5.0, **options):
+    return asyncio.run(train_live(trainer, minutes, **options))
 
 
 def drawn(ax):
@@ -86,13 +89,12 @@ def test_learnt_tracks_stand_beside_the_truth():
         tracks_and_truth(clip, pred.select(np.arange(3)))
 
 
-def test_the_live_plot_redraws_in_time_and_can_be_stopped(lines):
-    live = LivePlot(lines[:1], every=1e9)
+def test_the_live_plot_is_drawn_anew_and_can_be_stopped(lines):
+    live = LivePlot(lines[:1])
     before = live.picture.value
-    live.watch(lines[1])
-    assert live.picture.value == before and live.lines == lines[:2]  # too soon
-    live.every = 0
-    live.watch(lines[2])
+    live.lines += lines[1:3]
+    assert live.picture.value == before
+    live.draw()
     assert live.picture.value != before and "tracking, step 3" in live.words.value
     assert not live.stopped
     live.button.click()
@@ -106,7 +108,7 @@ def trainer(tmp_path, clips):
 
 
 def test_training_watched_goes_to_the_end(trainer):
-    lines = train_live(trainer, minutes=5, every=0)
+    lines = watched(trainer, every=0.01)
     assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
     assert sum("val_APD3D_none" in line for line in lines) == 2
     assert (trainer.journal.folder / "weights.safetensors").exists()
@@ -114,19 +116,36 @@ def test_training_watched_goes_to_the_end(trainer):
 
 def test_what_was_stopped_goes_on(trainer, monkeypatch):
     monkeypatch.setattr(LivePlot, "stopped", property(lambda live: len(live.lines) >= 3))
-    assert len(train_live(trainer, minutes=5)) == 3
+    assert len(watched(trainer)) == 3
     assert (trainer.journal.folder / "checkpoint.pt").exists()
-    assert len(train_live(trainer, minutes=0)) == 4  # the button, and the time: each after one more step
+    assert len(watched(trainer, minutes=0)) == 4  # the button, and the time: each after one more step
     monkeypatch.undo()
-    assert [line["step"] for line in train_live(trainer, minutes=5)] == [1, 2, 3, 4, 5, 6]
+    assert [line["step"] for line in watched(trainer)] == [1, 2, 3, 4, 5, 6]
 
 
-def test_interrupting_the_kernel_stops_between_two_steps(trainer, monkeypatch):
-    before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(LivePlot, "watch", lambda *_: os.kill(os.getpid(), signal.SIGINT))
-    train_live(trainer, minutes=5)
-    assert trainer.step == 1 and signal.getsignal(signal.SIGINT) is before
-    assert len((trainer.journal.folder / "log.jsonl").read_text().splitlines()) == 1
+def test_interrupting_the_kernel_stops_between_two_steps(trainer):
+    async def cell():
+        cell = asyncio.current_task()
+        trainer.group.any = lambda wish: asyncio.run_coroutine_threadsafe(interrupt(cell), loop).result() or wish
+        loop = asyncio.get_running_loop()
+        return await train_live(trainer, 5)
+
+    async def interrupt(cell):
+        cell.cancel()
+        await asyncio.sleep(0.01)
+
+    lines = asyncio.run(cell())
+    assert 1 <= len(lines) <= 2 and trainer.step == len(lines)
+    assert len((trainer.journal.folder / "log.jsonl").read_text().splitlines()) == trainer.step
+
+
+def test_what_goes_wrong_while_watched_is_told(trainer, monkeypatch):
+    def fail(*_):
+        raise FloatingPointError("not finite")
+
+    monkeypatch.setattr(trainer, "_one_step", fail)
+    with pytest.raises(FloatingPointError, match="not finite"):
+        watched(trainer)
 
 
 def test_steps_fit_the_time(monkeypatch, clips):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,6 @@ from matplotlib.figure import Figure
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project
-from tapip3d_lite.training.command import interruptible
 from tapip3d_lite.training.journal import read_log
 from tapip3d_lite.training.trainer import Trainer
 from tapip3d_lite.ui.figures import png_bytes
@@ -63,6 +63,7 @@ def learning_curve(
     axes[2].set_ylim(0, 1)
     if stages[1]:
         axes[1].set_yscale("log")
+        axes[1].tick_params(which="minor", labelsize=7)
         axes[2].legend(fontsize=7, frameon=False, loc="upper left")
     return figure
 
@@ -93,27 +94,22 @@ def tracks_and_truth(clip: Clip, pred: Tracks, frames: Sequence[int] | None = No
 
 
 class LivePlot:
-    """A picture of a running training and a button that stops it; `box` is what to display.
-
-    The button works while the cell runs where JupyterLab and the kernel know subshells (4.4 with ipykernel 7, or
-    later); everywhere else "Kernel, Interrupt" does the same.
+    """A picture of a running training and a button that stops it.
 
     Attributes:
-        box: the widget.
+        box: the widget to display.
+        lines: of the log, in order; add to it, then `draw`.
     """
 
-    def __init__(
-        self, lines: Sequence[Line] = (), zero_motion: Mapping[str, float] | None = None, every: float = 5.0
-    ) -> None:
+    def __init__(self, lines: Sequence[Line] = (), zero_motion: Mapping[str, float] | None = None) -> None:
         """Show what there is already.
 
         Args:
             lines: of the log so far.
             zero_motion: see `learning_curve`.
-            every: seconds between two drawings.
         """
-        self.lines, self.zero_motion, self.every = list(lines), zero_motion, every
-        self._pressed, self._drawn, self._begun = threading.Event(), 0.0, time.monotonic()
+        self.lines, self.zero_motion = list(lines), zero_motion
+        self._pressed, self._begun = threading.Event(), time.monotonic()
         # An image, not an Output: programs that run notebooks (nbclient) may wait long for messages that Outputs send.
         self.picture, self.words = widgets.Image(format="png"), widgets.Label()
         self.button = widgets.Button(description="Stop", icon="stop", tooltip="Stop after this step; all is kept")
@@ -131,27 +127,22 @@ class LivePlot:
         """Whether the button was pressed."""
         return self._pressed.is_set()
 
-    def watch(self, line: Line) -> None:
-        """Take one more line of the log; to be given to `Trainer.run`."""
-        self.lines.append(line)
-        if time.monotonic() - self._drawn >= self.every:
-            self.draw()
-
     def draw(self) -> None:
         """Draw all lines now."""
-        self.picture.value = png_bytes(learning_curve(self.lines, self.zero_motion))
-        self._drawn = time.monotonic()
-        if self.lines:
-            minutes = (self._drawn - self._begun) / 60
-            self.words.value = f"{self.lines[-1]['stage']}, step {self.lines[-1]['step']}, {minutes:.1f} min"
+        lines = list(self.lines)  # another thread may be adding to it
+        self.picture.value = png_bytes(learning_curve(lines, self.zero_motion))
+        if lines:
+            minutes = (time.monotonic() - self._begun) / 60
+            self.words.value = f"{lines[-1]['stage']}, step {lines[-1]['step']}, {minutes:.1f} min"
 
 
-def train_live(
+async def train_live(
     trainer: Trainer, minutes: float, zero_motion: Mapping[str, float] | None = None, every: float = 5.0
 ) -> list[Line]:
     """Train in a notebook's cell, watched: until the end, the time is up, Stop, or "Kernel, Interrupt".
 
-    Whatever ends it, everything is saved, and the same call goes on from there.
+    To be awaited: the training runs in a thread of its own, so that the kernel stays free to hear the button. Whatever
+    ends it, everything is saved, and the same call goes on from there.
 
     Args:
         trainer: as it stands.
@@ -161,16 +152,35 @@ def train_live(
 
     Returns:
         All lines of the log.
+
+    Raises:
+        FloatingPointError: see `Trainer.run`.
     """
     log = trainer.journal.folder / "log.jsonl"
-    live = LivePlot(read_log(log) if log.exists() else (), zero_motion, every)
+    live = LivePlot(read_log(log) if log.exists() else (), zero_motion)
     end = time.monotonic() + 60 * minutes
     display(live.box)
-    with interruptible() as interrupted:
-        trainer.run(lambda: live.stopped or interrupted() or time.monotonic() > end, live.watch, progress=False)
+    run = asyncio.to_thread(
+        trainer.run, lambda: live.stopped or time.monotonic() > end, live.lines.append, progress=False
+    )
+    training = asyncio.create_task(run)
+    while not training.done():
+        if await _interrupted(training, every):
+            live.press()
+        live.draw()
     live.button.disabled = True
     live.draw()
+    await training  # raises what went wrong
     return live.lines
+
+
+async def _interrupted(training: asyncio.Task, seconds: float) -> bool:
+    """Wait, at most until the training is done; whether the kernel was interrupted meanwhile."""
+    try:
+        await asyncio.wait({training}, timeout=seconds)
+    except asyncio.CancelledError:  # what "Kernel, Interrupt" makes of a cell that awaits
+        return True
+    return False
 
 
 def _curve(
