@@ -14,31 +14,58 @@ from torch import nn
 
 import tapip3d_lite as t3d
 from tapip3d_lite.evaluation import bench
-from tapip3d_lite.evaluation.timing import extra_memory, ratios, side_by_side, stages
+from tapip3d_lite.evaluation.timing import extra_memory, own_clock, ratios, side_by_side, stages
 from tapip3d_lite.ui.speed import speed
 
 LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory is read from /proc")
 
 
+class Watch:
+    """A clock that stands still between runs."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+    def run(self, seconds):
+        self.now += seconds
+
+
 def test_ways_take_turns():
-    order = []
-    runs = {name: lambda name=name: (order.append(name), time.sleep(0.01 if name == "a" else 0.03)) for name in "ab"}
-    seconds = side_by_side(runs, rounds=2)
+    order, watch = [], Watch()
+    runs = {name: lambda name=name: (order.append(name), watch.run(1 if name == "a" else 3)) for name in "ab"}
+    seconds = side_by_side(runs, rounds=2, clock=watch)
     assert order == ["a", "b"] * 3
-    assert all(0.01 <= x < 0.03 for x in seconds["a"]) and all(x >= 0.03 for x in seconds["b"])
+    assert seconds == {"a": [1, 1], "b": [3, 3]}
     assert ratios([2.0, 6.0, 3.0], [1.0, 1.0, 1.0]) == (2.0, 3.0, 6.0)
 
 
+def test_waiting_does_not_count_with_one_thread():
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        assert own_clock() is time.perf_counter
+        torch.set_num_threads(1)
+        seconds = side_by_side({"wait": lambda: time.sleep(0.1)}, rounds=1, clock=own_clock())
+    finally:
+        torch.set_num_threads(threads)
+    assert seconds["wait"][0] < 0.05
+
+
 def test_stages_add_up_and_leave_no_hooks():
+    watch = Watch()
+
     class Slow(nn.Module):
         def forward(self, x):
-            time.sleep(0.02)
+            watch.run(2)
             return x
 
     first, second = Slow(), Slow()
-    with stages({"first": first, "second": second}) as spent:
+    with stages({"first": first, "second": second}, watch) as spent:
         second(first(second(0)))
-    assert 0.02 <= spent["first"] < 0.04 <= spent["second"] < 0.08
+    assert spent == {"first": 2, "second": 4}
     assert not first._forward_hooks and not first._forward_pre_hooks
 
 
@@ -52,7 +79,8 @@ def fail():
 
 @LINUX
 def test_extra_memory_is_what_a_run_allocates():
-    assert 63 < extra_memory(allocate, 64) < 80
+    mib, seconds = extra_memory(allocate, 64)
+    assert 63 < mib < 80 and 0 < seconds < 10
     with pytest.raises(RuntimeError, match="fail"):
         extra_memory(fail)
 
@@ -105,7 +133,7 @@ def test_model_rows_have_stages_equal_numbers_and_memory():
 
 
 def test_memory_and_scaling_parts(monkeypatch):
-    monkeypatch.setattr(bench, "extra_memory", lambda prepare, *a: float(prepare(*a)() is not None))
+    monkeypatch.setattr(bench, "extra_memory", lambda prepare, *a: (float(prepare(*a)() is not None), 0.5))
     from tapip3d_lite.model import inference
 
     monkeypatch.setattr(inference, "_KEPT", inference._KEPT)  # restored afterwards
@@ -134,7 +162,7 @@ def test_command_writes_every_measurement(tmp_path):
     stored = json.loads(out.read_text())
     assert all(len(row["seconds"]) == 2 for row in stored) and figure.stat().st_size > 5000
     wrong = subprocess.run([*command, "speed"], capture_output=True, text=True, env=environment)
-    assert wrong.returncode == 2 and "expected parts among model, knn" in wrong.stderr
+    assert wrong.returncode == 2 and "expected parts among model, iteration, knn" in wrong.stderr
 
 
 @pytest.mark.parametrize("options", [{"parts": ["speed"]}, {"rounds": 0}])

@@ -6,10 +6,8 @@ them, and neither does the proof that results are equal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,8 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.evaluation.timing import extra_memory, ratios, side_by_side, stages
+from tapip3d_lite.evaluation.rows import Row, compared, table
+from tapip3d_lite.evaluation.timing import extra_memory, own_clock, side_by_side, stages
 from tapip3d_lite.model.cloud import feature_cloud
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.frames import frames_from_clip, resize_clip
@@ -29,30 +28,8 @@ from tapip3d_lite.simulate import simulate_clip
 from tapip3d_lite.training.backward import saving_backward
 from tapip3d_lite.training.loss import LossConfig, Truth
 
+__all__ = ["PARTS", "Row", "bench", "table"]
 SLOW, FAST, SHORT = "straightforward", "fast", "fast, bf16"
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the table.
-
-    Attributes:
-        part: of the bench.
-        case: what was computed.
-        way: how.
-        seconds: of each round.
-        faster: (minimum, median, maximum) of how many times sooner than the way named in `than` it was done.
-        than: the way compared with.
-        values: other numbers by name.
-    """
-
-    part: str
-    case: str
-    way: str = ""
-    seconds: list[float] = field(default_factory=list)
-    faster: tuple[float, float, float] | None = None
-    than: str = ""
-    values: dict[str, float] = field(default_factory=dict)
 
 
 def make_tracker(preset: str = "lite", fast: bool = True, **changes: Any) -> Tracker:
@@ -85,45 +62,42 @@ def tracking(clip: Clip, tracker: Tracker, bf16: bool = False, device: str = "cp
     return run
 
 
-def compared(part: str, case: str, seconds: dict[str, list[float]], **values: dict[str, float]) -> Iterator[Row]:
-    """Rows of ways that took turns, all compared with the first; `values` by way, spaces written as `_`."""
-    first = next(iter(seconds))
-    for way, times in seconds.items():
-        faster = None if way == first else ratios(seconds[first], times)
-        yield Row(part, case, way, times, faster, "" if faster is None else first, values.get(way, {}))
-
-
-def bench_model(quick: bool = False, rounds: int = 3) -> Iterator[Row]:
+def bench_model(
+    quick: bool = False, rounds: int = 3, counts: Sequence[int] = (128, 512, 1024), iterations: int = 6
+) -> Iterator[Row]:
     """(a) The paper's model on 16 frames: straightforward, fast, and fast in bfloat16; by stage, with peak memory."""
-    size, counts, iterations = ((96, 128), [16], 1) if quick else ((384, 512), [128, 512, 1024], 6)
+    size, counts, iterations = ((96, 128), [16], 1) if quick else ((384, 512), counts, iterations)
     changes = {"image_size": size, "iterations": iterations} | ({"levels": 2} if quick else {})
     trackers = {way: make_tracker("paper", way != SLOW, **changes) for way in (SLOW, FAST, SHORT)}
     for count in counts:
-        clip, case = make_clip(16, count, size), f"{count} queries"
+        clip, case = make_clip(16, count, size), f"{count} queries" + ", 1 iteration" * (iterations == 1)
         spent: dict[str, dict[str, list[float]]] = {}
         results: dict[str, Any] = {}
         runs = {w: partial(_by_stage, tracking(clip, t, w == SHORT), t, w, spent, results) for w, t in trackers.items()}
-        seconds = side_by_side(runs, rounds if count <= 128 else -(-rounds // 3), warm=False)  # minutes each
+        # Without a warm-up: the larger ones take minutes.
+        seconds = side_by_side(runs, rounds if count <= 128 else -(-rounds // 3), warm=False, clock=own_clock())
         exact, values = results[SLOW][0], {}
         for way in (FAST, SHORT):
             error = (results[way][0] - exact).norm(dim=-1).flatten()
             values[way] = {"median difference": float(error.median()), "largest difference": float(error.max())}
-        for way, tracker in trackers.items() if count != 512 else ():
-            memory = extra_memory(_ready_model, count, size, changes, tracker.fast, way == SHORT)
-            if memory is not None:
-                values.setdefault(way, {})["MiB"] = memory
+        for way, tracker in trackers.items() if count == 512 or quick else ():
+            grown = extra_memory(_ready_model, count, size, changes, tracker.fast, way == SHORT)
+            if grown is not None:
+                values.setdefault(way, {})["MiB"] = grown[0]
         yield from compared("model", case, seconds, **values)
         for stage, times in spent.items():
             yield from compared("model", f"{case}: {stage}", times)
 
 
 def _by_stage(run: Callable, tracker: Tracker, way: str, spent: dict, results: dict) -> None:
-    parts = {"encoder": tracker.encoder, "k-NN": tracker.neighborhood, "updater": tracker.updater}
-    start = perf_counter()
-    with stages(parts) as seconds:
+    names = {"encoder": "encoder", "k-NN": "neighborhood", "context": "context", "updater": "updater"}
+    parts = {stage: getattr(tracker, name) for stage, name in names.items()}
+    clock = own_clock()
+    start = clock()
+    with stages(parts, clock) as seconds:
         results[way] = run()
-    rest = perf_counter() - start - sum(seconds.values())
-    for stage, time in (seconds | {"context and the rest": rest}).items():
+    rest = clock() - start - sum(seconds.values())
+    for stage, time in (seconds | {"the rest": rest}).items():
         spent.setdefault(stage, {}).setdefault(way, []).append(time)
 
 
@@ -142,7 +116,7 @@ def bench_knn(quick: bool = False, rounds: int = 5) -> Iterator[Row]:
     total: dict[str, list[float]] = {}
     for level in cloud:
         maps = level.points[0].contiguous()
-        seconds = side_by_side(_knn_ways(queries, maps, 32), rounds)
+        seconds = side_by_side(_knn_ways(queries, maps, 32), rounds, clock=own_clock())
         yield from compared("k-NN", f"maps {maps.shape[1]}x{maps.shape[2]}", _best_first(seconds))
         total = {
             way: [a + b for a, b in zip(times, total.get(way, [0] * rounds), strict=True)]
@@ -189,7 +163,8 @@ def bench_training(quick: bool = False, rounds: int = 5) -> Iterator[Row]:
         saving_backward(tracker, frames_from_clip(clip), queries, truth, LossConfig())
 
     trackers = {way: make_tracker("lite", way == FAST, image_size=size).train() for way in (SLOW, FAST)}
-    seconds = side_by_side({way: partial(step, tracker) for way, tracker in trackers.items()}, rounds)
+    runs = {way: partial(step, tracker) for way, tracker in trackers.items()}
+    seconds = side_by_side(runs, rounds, clock=own_clock())
     yield from compared("training step", f"lite, {frames} frames, {count} queries", seconds)
 
 
@@ -204,7 +179,7 @@ def bench_scaling(quick: bool = False, rounds: int = 3) -> Iterator[Row]:
             tracker = make_tracker(image_size=(now["side"],) * 2, neighbors=now["K"])
             runs[f"{name} = {value}"] = tracking(make_clip(now["T"], now["N"], tracker.config.image_size), tracker)
         case = ", ".join(f"{key} = {value}" for key, value in base.items() if key != name)
-        for way, seconds in side_by_side(runs, rounds).items():
+        for way, seconds in side_by_side(runs, rounds, clock=own_clock()).items():
             yield Row("scaling", case, way, seconds)
 
 
@@ -213,9 +188,10 @@ def bench_memory(quick: bool = False, rounds: int = 1) -> Iterator[Row]:
     count, lengths = (64, [8, 16]) if quick else (2048, [38, 75, 150, 300])
     for frames in lengths:
         for way, kept in (("features kept", 2**40), ("streamed", 0)):
-            memory = extra_memory(_ready_track, frames, count, kept)
-            if memory is not None:
-                yield Row("memory", f"{frames} frames, {count} queries", way, values={"MiB": memory, "frames": frames})
+            grown = extra_memory(_ready_track, frames, count, kept)
+            if grown is not None:
+                values = {"MiB": grown[0], "frames": frames}
+                yield Row("memory", f"{frames} frames, {count} queries", way, [grown[1]], values=values)
 
 
 def _ready_track(frames: int, count: int, kept: int) -> Callable[[], Any]:
@@ -258,6 +234,7 @@ def bench_gpu(quick: bool = False, rounds: int = 5, device: str = "cuda") -> Ite
 
 PARTS: dict[str, Callable[..., Iterator[Row]]] = {
     "model": bench_model,
+    "iteration": partial(bench_model, counts=(128,), iterations=1),
     "knn": bench_knn,
     "training": bench_training,
     "scaling": bench_scaling,
@@ -282,16 +259,3 @@ def bench(parts: Iterable[str] = tuple(PARTS), quick: bool = False, rounds: int 
         raise ValueError(f"bench: expected parts among {', '.join(PARTS)} and rounds >= 1, got {unknown}, {rounds}")
     for part in parts:
         yield from PARTS[part](quick, **({} if rounds is None else {"rounds": rounds}))
-
-
-def table(rows: list[Row]) -> str:
-    """Rows as a Markdown table; `faster` is median (minimum to maximum)."""
-    lines = ["| part | case | way | seconds | times faster | than | |", "|---|---|---|---|---|---|---|"]
-    for row in rows:
-        seconds = f"{np.median(row.seconds):.3g}" if row.seconds else ""
-        faster = "" if row.faster is None else "{1:.2f} ({0:.2f} to {2:.2f})".format(*row.faster)
-        values = ", ".join(f"{name} {value:.3g}" for name, value in row.values.items() if name != "frames")
-        lines.append(f"| {row.part} | {row.case} | {row.way} | {seconds} | {faster} | {row.than} | {values} |")
-    if any(row.part == "k-NN" for row in rows) and not any(row.way == "cKDTree" for row in rows):
-        lines.append("\nSciPy is not installed, so its cKDTree was not measured.")
-    return "\n".join(lines)

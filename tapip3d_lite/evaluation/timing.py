@@ -12,28 +12,37 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
+import torch
 from torch import nn
 
 
-def side_by_side(runs: dict[str, Callable[[], Any]], rounds: int = 3, warm: bool = True) -> dict[str, list[float]]:
+def own_clock() -> Callable[[], float]:
+    """The processor's time with one torch thread, which other work on the machine does not lengthen; else the wall's."""
+    return process_time if torch.get_num_threads() == 1 else perf_counter
+
+
+def side_by_side(
+    runs: dict[str, Callable[[], Any]], rounds: int = 3, warm: bool = True, clock: Callable[[], float] = perf_counter
+) -> dict[str, list[float]]:
     """Seconds of functions that take turns.
 
     Args:
         runs: functions by name.
         rounds: how often each is measured.
         warm: run each once before, unmeasured.
+        clock: tells seconds.
     """
     for run in runs.values() if warm else ():
         run()
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(rounds):
         for name, run in runs.items():
-            start = perf_counter()
+            start = clock()
             run()
-            seconds[name].append(perf_counter() - start)
+            seconds[name].append(clock() - start)
     return seconds
 
 
@@ -44,15 +53,15 @@ def ratios(slow: list[float], fast: list[float]) -> tuple[float, float, float]:
 
 
 @contextmanager
-def stages(parts: dict[str, nn.Module]) -> Iterator[dict[str, float]]:
+def stages(parts: dict[str, nn.Module], clock: Callable[[], float] = perf_counter) -> Iterator[dict[str, float]]:
     """Collect the seconds spent in modules' forward passes, by name, while the context lasts."""
     spent, started, handles = dict.fromkeys(parts, 0.0), {}, []
 
     def begin(name: str) -> None:
-        started[name] = perf_counter()
+        started[name] = clock()
 
     def end(name: str) -> None:
-        spent[name] += perf_counter() - started[name]
+        spent[name] += clock() - started[name]
 
     for name, part in parts.items():
         handles.append(part.register_forward_pre_hook(lambda *_, name=name: begin(name)))
@@ -64,15 +73,15 @@ def stages(parts: dict[str, nn.Module]) -> Iterator[dict[str, float]]:
             handle.remove()
 
 
-def extra_memory(prepare: Callable[..., Callable[[], Any]], *arguments: Any) -> float | None:
-    """MiB by which the memory of a fresh process grows at most while a function runs.
+def extra_memory(prepare: Callable[..., Callable[[], Any]], *arguments: Any) -> tuple[float, float] | None:
+    """MiB by which the memory of a fresh process grows at most while a function runs, and the seconds that it takes.
 
     Args:
         prepare: at the top level of a module, since a new process looks it up by name; returns the function.
         arguments: of `prepare`.
 
     Returns:
-        The growth, or None where the system does not tell the peak (outside Linux).
+        (growth, seconds), or None where the system does not tell the peak (outside Linux).
 
     Raises:
         RuntimeError: the process failed.
@@ -94,9 +103,10 @@ def extra_memory(prepare: Callable[..., Callable[[], Any]], *arguments: Any) -> 
 
 def _measure(sender: Any, prepare: Callable[..., Callable[[], Any]], arguments: tuple) -> None:
     run = prepare(*arguments)
-    before = _memory("VmRSS")
+    before, clock = _memory("VmRSS"), own_clock()
+    start = clock()
     run()
-    sender.send(_memory("VmHWM") - before)
+    sender.send((_memory("VmHWM") - before, clock() - start))
 
 
 def _memory(field: str) -> float:

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from tapip3d_lite.evaluation.bench import Row
 
-_STAGES = ("encoder", "k-NN", "context and the rest", "updater")
-_COLOURS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2")
+_STAGES = ("encoder", "k-NN", "context", "updater", "the rest")
+_COLOURS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d9d9d")
 
 
 def speed(rows: Sequence[Row]) -> Figure:
