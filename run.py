@@ -23,7 +23,8 @@ STAMP = VENV / "installed.sha256"
 COMMANDS = {
     "setup": "make or update the environment, nothing else",
     "lab": "start JupyterLab on the notebooks; options are passed on, e.g. --no-browser --port 9000",
-    "test": "style, unit tests, then every notebook on the CPU; arguments go to pytest, and then notebooks are left out",
+    "test": "style, unit tests, then every notebook on the CPU; --browser also moves sliders in Chromium or Chrome; "
+    "other arguments go to pytest, and then notebooks are left out",
     "demo": "track a sample clip, write a 3D page and a picture; arguments as for `python -m tapip3d_lite demo`",
     "notebooks": "run the notebooks and store their fresh outputs; names select some, e.g. 01_lifting",
 }
@@ -78,6 +79,12 @@ def run_lab(*arguments: str) -> int:
 
 
 def run_test(*arguments: str) -> int:
+    if (
+        "--browser" in arguments
+    ):  # its driver of 165 MB is only for those who ask; without it the test says it is skipped
+        _call("-m", "pip", "--disable-pip-version-check", "install", "--quiet", "-r", "requirements-browser.txt")
+        os.environ["TAPIP3D_BROWSER"] = "1"
+        arguments = tuple(a for a in arguments if a != "--browser")
     if arguments:
         return _call("-m", "pytest", *arguments)
     unit = _call("-m", "pytest", "tests")

@@ -144,3 +144,19 @@ def test_run_py_passes_options_on(monkeypatch):
     assert calls[1][-3:] == ("--no-browser", "--port", "9000")
     assert calls[2] == ("-m", "tapip3d_lite", "demo", "clip.npz")
     assert len(calls) == 5  # all tests: unit tests, then notebooks
+
+
+def test_run_py_tries_a_browser_only_when_asked(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    import run
+
+    calls = []
+    monkeypatch.setenv("TAPIP3D_BROWSER", "")  # so that it is put back afterwards
+    monkeypatch.delenv("TAPIP3D_BROWSER")
+    monkeypatch.setattr(
+        run, "_call", lambda *arguments: calls.append((arguments, "TAPIP3D_BROWSER" in os.environ)) or 0
+    )
+    assert run.run_test() == 0 and not any(asked for _, asked in calls)
+    assert run.run_test("--browser") == 0
+    assert [arguments[1] for arguments, _ in calls] == ["pytest"] * 2 + ["pip"] + ["pytest"] * 2
+    assert all("--browser" not in arguments for arguments, _ in calls) and all(asked for _, asked in calls[3:])

@@ -1,0 +1,204 @@
+"""In a browser: JupyterLab runs notebooks, sliders move figures. `python3 run.py test --browser` runs it.
+
+Everything is asked of the figures' state (plotly's slider and traces, the explorer's picture as bytes), not of pixels.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tapip3d_lite.ui.teaching import read_notebook
+from tests.notebook_tools import FOLDER, ROOT
+
+BROWSERS = [
+    *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge", "microsoft-edge"),
+    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    r"C:\Program Files\Google\Chrome\Application\chrome.exe",
+]
+BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
+CHOSEN = [next(FOLDER.glob(f"{number}_*.ipynb")) for number in ("00", "03", "04")]
+SECONDS = 300  # the longest that anything is waited for
+
+pytestmark = [
+    pytest.mark.skipif("TAPIP3D_BROWSER" not in os.environ, reason="run by `python3 run.py test --browser`"),
+    pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome found: sliders are not tried in a browser"),
+]
+
+SETTINGS = {
+    "notebook-extension/tracker": {"windowingMode": "none"},  # cells out of sight are drawn, too
+    "apputils-extension/notification": {"fetchNews": "false", "checkForUpdates": False},
+    "docmanager-extension/plugin": {"autosave": False},
+}
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A JupyterLab on copies of the notebooks; gives its address with a place for a notebook's name."""
+    home = tmp_path_factory.mktemp("lab")
+    shutil.copytree(ROOT / "notebooks", home / "notebooks")
+    shutil.copytree(ROOT / "data_samples", home / "data_samples")
+    for name, values in SETTINGS.items():
+        file = home / "config/lab/user-settings/@jupyterlab" / f"{name}.jupyterlab-settings"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(values))
+    places = {f"JUPYTER_{kind}_DIR": str(home / kind.lower()) for kind in ("CONFIG", "DATA", "RUNTIME")}
+    options = ["--no-browser", "--port=0", "--expose-app-in-browser", "--allow-root"]
+    with (home / "log").open("w") as log:
+        server = subprocess.Popen(
+            [sys.executable, "-m", "jupyterlab", *options],
+            cwd=home / "notebooks",
+            env=os.environ | places,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    try:
+        yield address(server, home)
+    finally:
+        server.terminate()  # it ends its kernels
+        try:
+            server.wait(20)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait()
+
+
+def address(server, home, seconds=60):
+    """Wait until the server has written where it listens, and with which token."""
+    end = time.monotonic() + seconds
+    while not (files := list(home.glob("runtime/jpserver-*[0-9].json"))):
+        assert server.poll() is None and time.monotonic() < end, (home / "log").read_text()
+        time.sleep(0.05)
+    info = json.loads(files[0].read_text())
+    return f"{info['url']}lab/tree/{{}}?reset&token={info['token']}"  # no tabs of before
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="no playwright; `run.py test --browser` installs it")
+    # WebGL without a graphics card.
+    options = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with playwright.sync_playwright() as play:
+        running = play.chromium.launch(executable_path=BROWSER, args=options)
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def page(browser):
+    page = browser.new_page(viewport={"width": 1400, "height": 1000})
+    page.set_default_timeout(1000 * SECONDS)
+    page.problems = []
+    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    yield page
+    page.close()
+
+
+RUN_ALL = """async seconds => {
+    const panel = jupyterapp.shell.currentWidget
+    const late = new Promise((_, fail) => setTimeout(() => fail(`cells still run after ${seconds} s`), 1000 * seconds))
+    const run = async () => {
+        await panel.context.ready
+        await panel.sessionContext.ready
+        await jupyterapp.commands.execute('notebook:run-all-cells')
+    }
+    await Promise.race([run(), late])
+    const cells = Array.from(panel.content.widgets).filter(c => c.model.type === 'code')
+    return cells.map(c => [c.model.executionCount, c.model.outputs.toJSON().filter(o => o.output_type === 'error')])
+}"""
+
+
+@pytest.mark.parametrize("path", CHOSEN, ids=lambda p: p.stem)
+def test_a_notebook_runs_and_its_figures_follow_their_controls(path, lab, page):
+    page.goto(lab.format(path.name))
+    page.wait_for_function("name => window.jupyterapp?.shell.currentWidget?.context?.path === name", arg=path.name)
+    cells = page.evaluate(RUN_ALL, SECONDS)
+    assert [number for number, _ in cells] == list(range(1, len(cells) + 1))
+    assert not [errors for _, errors in cells if errors]
+
+    source = "\n".join(cell["source"] for cell in read_notebook(path)["cells"] if cell["cell_type"] == "code")
+    scenes, explorers = page.locator(".js-plotly-plot"), page.locator(".widget-vbox:has(> .widget-image)")
+    assert (scenes.count() > 0) == ("show_3d(" in source)
+    assert explorers.count() == source.count("explore(")
+    for i in range(scenes.count()):
+        move_slider(page, scenes.nth(i))
+    for i in range(explorers.count()):
+        move_controls(page, explorers.nth(i))
+    assert not page.problems
+    page.evaluate("() => jupyterapp.shell.currentWidget.sessionContext.shutdown()")
+
+
+SCENE = """g => {
+    // Numbers of a frame that was not shown yet are still packed.
+    const types = { f4: Float32Array, f8: Float64Array }
+    const unpack = x => new types[x.dtype](Uint8Array.from(atob(x.bdata), c => c.charCodeAt()).buffer)
+    const plain = x => Array.from(x.bdata ? unpack(x) : x)
+    const frames = g._transitionData._frames
+    const moving = frames[0].traces ?? frames[0].data.map((_, i) => i)
+    return {
+        active: g._fullLayout.sliders[0].active,
+        shown: moving.map(i => plain(g._fullData[i].x)),
+        frames: frames.map(frame => frame.data.map(trace => plain(trace.x))),
+        eye: g._fullLayout.scene.camera.eye,
+    }
+}"""
+
+
+def move_slider(page, scene):
+    """A click on the slider shows the points of that frame and leaves the view alone."""
+    scene.scroll_into_view_if_needed()
+    before = scene.evaluate(SCENE)
+    last = len(before["frames"]) - 1
+    assert last > 2 and before["shown"] == before["frames"][before["active"]]
+    rail, wanted = scene.locator(".slider-rail-touch-rect").bounding_box(), round(0.7 * last)
+    page.mouse.click(rail["x"] + wanted / last * rail["width"], rail["y"] + rail["height"] / 2)
+    same = f"([g, points]) => JSON.stringify(({SCENE})(g).shown) === JSON.stringify(points)"
+    until(page, same, [scene.element_handle(), before["frames"][wanted]])
+    after = scene.evaluate(SCENE)
+    assert after["active"] == wanted != before["active"]
+    assert after["shown"] == after["frames"][wanted] != before["shown"]
+    assert after["eye"] == before["eye"]
+
+
+# What an explorer shows: a digest of its picture's bytes, or why there is none.
+SHOWN = """async explorer => {
+    const image = explorer.querySelector(':scope > .widget-image')
+    if (getComputedStyle(image).display === 'none') return explorer.querySelector(':scope > .widget-html').innerText
+    const bytes = await (await fetch(image.src)).arrayBuffer()
+    return new Uint8Array(await crypto.subtle.digest('SHA-256', bytes)).join()
+}"""
+
+
+def move_controls(page, explorer):
+    """Every control takes its new value and changes what is shown; the old value brings the old picture back."""
+    explorer.scroll_into_view_if_needed()
+    handles, menus = explorer.locator(".noUi-handle"), explorer.locator("select")
+    assert handles.count() + menus.count() > 0
+    first = explorer.evaluate(SHOWN)
+    for i in range(handles.count()):
+        before, value = explorer.evaluate(SHOWN), float(handles.nth(i).get_attribute("aria-valuenow"))
+        handles.nth(i).press("ArrowRight")
+        changed(page, explorer, before)
+        assert float(handles.nth(i).get_attribute("aria-valuenow")) > value
+    for i in range(menus.count()):
+        before = explorer.evaluate(SHOWN)
+        menus.nth(i).select_option(index=1)
+        changed(page, explorer, before)
+        menus.nth(i).select_option(index=0)
+    for i in range(handles.count()):
+        handles.nth(i).press("ArrowLeft")
+    until(page, f"async ([e, first]) => (await ({SHOWN})(e)) === first", [explorer.element_handle(), first])
+
+
+def changed(page, explorer, before):
+    until(page, f"async ([e, old]) => (await ({SHOWN})(e)) !== old", [explorer.element_handle(), before])
+
+
+def until(page, condition, argument):
+    """Ask a few times a second, which leaves the browser time to draw."""
+    page.wait_for_function(condition, arg=argument, polling=200)
