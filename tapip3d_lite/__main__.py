@@ -139,10 +139,15 @@ def train(
     ] = None,
     resume: Annotated[bool, arg(help="continue from the folder's checkpoint, with its recipe")] = False,
     device: Annotated[str, arg(help="cpu or cuda; several processes: torchrun -m tapip3d_lite train …")] = "cpu",
+    measure: Annotated[bool, arg(help="only print where a step's time goes, and what backward keeps (CPU)")] = False,
 ) -> None:
     """Train a tracker on simulated clips, by default by the recipe of --preset (lite or paper); Ctrl-C saves and stops, --resume goes on exactly there."""
     from tapip3d_lite.training.command import train as run
 
+    if measure:
+        from tapip3d_lite.evaluation.training_cost import report
+
+        return print(report(config, (data or out / "clips") / "train"))
     try:
         finished, text = run(out, config, data, resume, device)
     except FloatingPointError as error:
