@@ -6,7 +6,7 @@ from importlib import import_module
 
 from tapip3d_lite.ui.exercises.core import Answer, Exercise, Mistake, Verdict, judge, score_guess
 
-_MODULES = ("start", "lifting", "world", "neighborhoods", "attention", "training")
+_MODULES = ("start", "lifting", "world", "neighborhoods", "attention", "training", "updates")
 
 EXERCISES: dict[str, Exercise] = {
     exercise.name: exercise for module in _MODULES for exercise in import_module(f"{__name__}.{module}").EXERCISES
