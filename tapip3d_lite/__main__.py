@@ -165,12 +165,13 @@ def card(
     out: Annotated[Path, arg(help="Markdown file")] = Path("MODEL_CARD.md"),
     name: Annotated[str, arg(help="of the model")] = "lite",
     weights: Annotated[Path | None, arg(help="the file, if not the folder's own")] = None,
+    command: Annotated[str | None, arg(help="that made it, e.g. with torchrun; default: from the recipe")] = None,
 ) -> None:
     """Write the model card of a training folder and of results that `benchmark --out` wrote."""
     from tapip3d_lite.files import atomic_path
     from tapip3d_lite.training.card import model_card
 
-    text = model_card(folder, results, hardware, name, weights=weights)
+    text = model_card(folder, results, hardware, name, command, weights)
     with atomic_path(out) as temporary:
         temporary.write_text(text, encoding="utf-8")
     print(f"wrote {out}")

@@ -51,7 +51,7 @@ def model_card(
         raise ValueError(
             f"card: expected steps in {folder / 'log.jsonl'} and scores in {results}; one of them is empty"
         )
-    command = command or f"python -m tapip3d_lite train --out {folder}{_flags(config)}"
+    command = command or f"python -m tapip3d_lite train --out runs/{name}{_flags(config)}"
     compared = [label for label in scores if any(split in scores[label] for split in SPLITS)]
     parts = [
         f"# Model card: `{name}`",
@@ -89,7 +89,8 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -
         "data": f"{config.clips} simulated clips; examples of {_range(config.frames)} frames and {config.sampling.tracks} "
         f"tracks; {'augmented' if config.augment else 'images not augmented'}",
         "steps": f"{min(log[-1]['step'], config.matching_steps)} of matching, "
-        f"{max(log[-1]['step'] - config.matching_steps, 0)} of tracking, {config.batch} clips a step and process",
+        f"{max(log[-1]['step'] - config.matching_steps, 0)} of tracking, batches of {config.batch} in each process"
+        + (f"; stopped at step {log[-1]['step']} of {config.total}" if log[-1]["step"] < config.total else ""),
         "recipe": f"AdamW {config.lr:g}, weight decay {config.weight_decay:g}, one cycle, M = {_range(config.iterations)}, "
         f"{config.precision}, encoder {'trained along' if config.train_encoder else 'frozen after matching'}, seed {config.seed}",
         "wall-clock": f"{log[-1]['seconds'] / 3600:.2f} h of steps (evaluations and simulation not counted)",
