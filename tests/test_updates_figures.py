@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
+from tapip3d_lite.geometry import project
 from tapip3d_lite.model.tokens import token_width
 from tapip3d_lite.model.windows import window_ends
 from tapip3d_lite.ui.exercises.updates import window_starts
@@ -73,9 +74,14 @@ def test_the_film_begins_and_ends_as_the_tracker_does(tracker, clip, queries, sh
 
 
 def test_converging_draws_the_iteration(clip, shown):
-    _, top, error = converging(clip, shown, 1, 2, 1).axes
+    image, top, error = converging(clip, shown, 1, 2, 1).axes
     np.testing.assert_allclose(top.lines[1].get_xydata(), shown.xyz[2][1, :, 1, :2])
     assert len(error.lines) == 2
+    drawn = image.lines[1].get_xydata()
+    for i, frame in enumerate(range(4, 8)):
+        uv, _ = project(shown.xyz[2][1, i, 1:2], clip.intrinsics[frame], clip.extrinsics[frame])
+        np.testing.assert_allclose(drawn[i], uv[0], rtol=1e-4)
+    assert len(drawn) == 4
     truth = clip.tracks.xyz[4:8, 1]
     np.testing.assert_allclose(error.lines[1].get_ydata(), 100 * np.linalg.norm(shown.xyz[2][1, :, 1] - truth, axis=-1))
     for bad in ({"track": 4, "window": 0}, {"window": 9}, {"iteration": 3}):

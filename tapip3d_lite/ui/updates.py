@@ -26,7 +26,7 @@ PARTS = ("motion", "virtual tracks")
 def token_parts(config: TrackerConfig, width: int) -> dict[str, int]:
     """Channels of every part of the token; `width` is the context's width at one level."""
     levels = {f"context, level {i}": width for i in range(config.levels)}
-    motion = {"motion to next frame": 3 * FACTOR, "motion to frame before": 3 * FACTOR}
+    motion = {"motion to the next and the previous frame": 6 * FACTOR}
     return {"visibility": 1} | levels | motion | ({"pixel (u, v)": 2 * FACTOR} if config.use_uv else {})
 
 
@@ -154,8 +154,8 @@ def converging(clip: Clip, shown: Film, track: int = 0, window: int = 0, iterati
     _image(image, clip.video[last], f"frame {last}, track {track}")
     truth, now = shown.truth[span, track], path[iteration, : errors.shape[1]]
     for xyz, color, name in ((truth, TRUTH, "truth"), (now, ESTIMATE, f"after {iteration} updates")):
-        uv, _ = project(xyz, clip.intrinsics[span], clip.extrinsics[span])
-        image.plot(*uv.T, ".-", color=color, lw=1.5, ms=4)
+        uv, _ = project(xyz[:, None], clip.intrinsics[span], clip.extrinsics[span])  # each frame by its camera
+        image.plot(*uv[:, 0].T, ".-", color=color, lw=1.5, ms=4)
         top.plot(*xyz[:, :2].T, ".-", color=color, lw=1.5, ms=5, label=name)
     _plot(top, "y (m)", "x (m)")
     everything = np.concatenate([path[:, : len(truth)].reshape(-1, 3), truth])[:, :2]
@@ -163,6 +163,7 @@ def converging(clip: Clip, shown: Film, track: int = 0, window: int = 0, iterati
     top.set_xlim(middle[0] - reach, middle[0] + reach)
     top.set_ylim(middle[1] - reach, middle[1] + reach)
     top.set_aspect("equal")
+    top.locator_params(nbins=4)
     top.legend(fontsize=7, frameon=False)
     top.set_title(f"window {window}, from above", fontsize=8, color=INK)
     for i in range(iteration + 1):
