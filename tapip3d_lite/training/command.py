@@ -52,6 +52,7 @@ def train(
         trainer = Trainer(out, config, clips, held_out, device, resume)
         with interruptible() as stop:
             finished = trainer.run(stop, progress=progress)
+        _wait()  # for the leader, which writes the weights
     if finished:
         return True, f"finished: {Path(out) / 'weights.safetensors'}"
     return False, f"stopped and saved at step {trainer.step} of {config.total}; continue with --resume"
