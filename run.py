@@ -79,9 +79,9 @@ def run_lab(*arguments: str) -> int:
 
 
 def run_test(*arguments: str) -> int:
-    if (
-        "--browser" in arguments
-    ):  # its driver of 165 MB is only for those who ask; without it the test says it is skipped
+    os.environ.setdefault("TAPIP3D_MINUTES", "0.4")  # how long notebook 06 trains
+    if "--browser" in arguments:
+        # Its driver of 165 MB is only for those who ask; without it the test says that it is skipped.
         _call("-m", "pip", "--disable-pip-version-check", "install", "--quiet", "-r", "requirements-browser.txt")
         os.environ["TAPIP3D_BROWSER"] = "1"
         arguments = tuple(a for a in arguments if a != "--browser")
