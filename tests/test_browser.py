@@ -52,7 +52,8 @@ def lab(tmp_path_factory):
         server = subprocess.Popen(
             [sys.executable, "-m", "jupyterlab", *options],
             cwd=home / "notebooks",
-            env=os.environ | places,
+            # One thread: those of torch and of WebGL drawn without a graphics card would wait for one another.
+            env=os.environ | places | {"OMP_NUM_THREADS": "1"},
             stdout=log,
             stderr=subprocess.STDOUT,
             start_new_session=True,
