@@ -23,7 +23,7 @@ class TrackerLike(Protocol):
         queries: np.ndarray | None = None,
         space: str | None = None,
         iterations: int | None = None,
-        support_grid: int = 16,
+        support_grid: int | None = None,
         bidirectional: bool = True,
         depth_roi: str | tuple[float, float] | None = "auto",
         visible_threshold: float | None = None,

@@ -408,6 +408,22 @@ def test_resized_depth_mixes_valid_pixels_only():
     assert not small[:, 3].any()
 
 
+def test_the_config_names_the_support_grid_where_the_caller_does_not(golden, clip):
+    tracker = golden.tracker
+    queries, options = pixel_queries(clip)[:2], {"iterations": 1, "bidirectional": False}
+    before = tracker.config
+    try:
+        tracker.config = before.replace(support_grid=2)
+        named, unnamed = (tracker.track(clip, queries, **options, **x).xyz for x in ({"support_grid": 2}, {}))
+        alone = tracker.track(clip, queries, **options, support_grid=0).xyz
+    finally:
+        tracker.config = before
+    assert np.array_equal(named, unnamed) and not np.array_equal(alone, named)
+    assert TrackerConfig().support_grid == 16
+    with pytest.raises(ValueError, match="support_grid"):
+        before.replace(support_grid=-1)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -20,6 +20,7 @@ from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.sampling import SamplingConfig, load_part
 from tapip3d_lite.training.trainer import Trainer
 
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
 SIZES |= {"context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2}
 SIZES |= {"time_depth": 1, "space_depth": 1, "virtual_tracks": 4}
@@ -60,7 +61,7 @@ def start(folder, clips):
         [sys.executable, "-c", RUN, str(folder), str(clips[0].parent)],
         stdout=subprocess.PIPE,
         text=True,
-        cwd=os.path.dirname(os.path.dirname(os.path.abspath(__file__))),
+        cwd=ROOT,
     )
 
 
@@ -161,6 +162,33 @@ def test_two_processes_give_the_gradients_of_one_with_twice_the_batch(tmp_path, 
     for a, b, c in zip(first, second, alone, strict=True):
         assert torch.equal(a, b)
         torch.testing.assert_close(a, c, rtol=1e-4, atol=1e-7)
+
+
+def test_torchrun_founds_one_training_for_all_processes(tmp_path):
+    options = "--clips 2 --matching-steps 1 --steps 2 --frames 8 8 --iterations 1 1 --validation 0 --sampling.tracks 8"
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
+    command = [*torchrun, "-m", "tapip3d_lite", "train", "--out", str(tmp_path), *options.split()]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and "finished" in done.stdout, done.stderr
+    assert [line["step"] for line in read_log(tmp_path)] == [1, 2, 3]
+    again = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert again.returncode != 0 and "--resume" in again.stderr
+
+
+def test_weights_to_start_from(tmp_path, clips):
+    first = Trainer(tmp_path / "first", recipe(), clips)
+    t3d.save_weights(first.tracker, tmp_path / "w.safetensors")
+    start = {"init": str(tmp_path / "w.safetensors"), "seed": 1}
+    second = Trainer(tmp_path / "second", recipe(**start), clips)
+    chance = Trainer(tmp_path / "chance", recipe(seed=1), clips)
+    states = [x.tracker.state_dict() for x in (first, second, chance)]
+    assert all(torch.equal(x, states[1][name]) for name, x in states[0].items())
+    assert not all(torch.equal(x, states[2][name]) for name, x in states[0].items())
+    with pytest.raises(ValueError, match="other sizes"):
+        Trainer(tmp_path / "third", recipe(**start, tracker=SIZES | {"hidden": 16}), clips)
+    with pytest.raises(ValueError, match="has no parameters"):
+        Trainer(tmp_path / "fourth", recipe(init="static"), clips)
 
 
 def test_a_folder_holds_one_recipe(tmp_path, clips):

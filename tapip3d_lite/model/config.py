@@ -77,6 +77,7 @@ class TrackerConfig:
         separate_vis_head: an own linear layer for visibility and (unused) confidence.
         outputs: 4 = (dx, dy, dz, dvis), or 5 with the unused confidence.
         iterations: M, updates of a window when the caller names no number.
+        support_grid: side of the grid of extra queries that `track` adds when the caller names none; 0: none.
         visible_threshold: probability from which a point counts as visible when the caller names none.
 
     Raises:
@@ -117,6 +118,7 @@ class TrackerConfig:
     separate_vis_head: bool = True
     outputs: int = 5
     iterations: int = 6
+    support_grid: int = 16
     visible_threshold: float = 0.9
 
     def __post_init__(self) -> None:
@@ -187,6 +189,8 @@ class TrackerConfig:
             raise ValueError(
                 f"TrackerConfig.space_depth: must divide time_depth = {self.time_depth}, got {self.space_depth}"
             )
+        if self.support_grid < 0:
+            raise ValueError(f"TrackerConfig.support_grid: expected 0 or more, got {self.support_grid}")
         if not 0 <= self.visible_threshold <= 1:
             raise ValueError(f"TrackerConfig.visible_threshold: expected a probability, got {self.visible_threshold}")
         if self.outputs not in (4, 5) or (self.separate_vis_head and self.outputs != 5):
@@ -242,5 +246,6 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "space_depth": 3,
         "virtual_tracks": 16,
         "iterations": 4,
+        "support_grid": 0,  # measured on held-out clips: no better with one, and 2.5 times slower
     },
 }

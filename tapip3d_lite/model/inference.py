@@ -30,7 +30,7 @@ def track(
     queries: np.ndarray | None = None,
     space: str | None = None,
     iterations: int | None = None,
-    support_grid: int = 16,
+    support_grid: int | None = None,
     bidirectional: bool = True,
     depth_roi: str | tuple[float, float] | None = "auto",
     visible_threshold: float | None = None,
@@ -48,7 +48,7 @@ def track(
         space: `"camera"` or `"world"` in place of the config's, if that is one of the two.
         iterations: M, the config's if None.
         support_grid: side of a grid of extra queries on the first frame (on the last one for the backward pass) that
-            are tracked along and dropped; 0: none.
+            are tracked along and dropped; 0: none; None: the config's.
         bidirectional: also track backward from queries after the first frame; otherwise frames before a query hold
             whatever the first window that contains it says.
         depth_roi: depths (near, far) that count for the scale; `"auto"`: up to q75 + 1.5 IQR of the clip; None: all.
@@ -61,6 +61,7 @@ def track(
     Raises:
         ValueError: queries outside the clip, a space that the model was not made for, or a bad option.
     """
+    support_grid = tracker.config.support_grid if support_grid is None else support_grid
     threshold = check_options(tracker, space, depth_roi, visible_threshold, support_grid)
     queries = resolve_queries(clip, queries)
     clip = resize_clip(clip, tracker.config.image_size)

@@ -14,6 +14,7 @@ from torch import distributed
 
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.data import training_clips, validation_clips
+from tapip3d_lite.training.journal import Journal
 from tapip3d_lite.training.trainer import Trainer
 
 
@@ -46,10 +47,11 @@ def train(
         if leads:
             clips = training_clips(data / "train", config.clips, progress, large=large)
             held_out = validation_clips(data / "validation", config.validation, progress) if config.validation else []
+            Journal(out, config, resume)  # refuses, or founds the folder, once for all processes
         _wait()
         if not leads:
             clips, held_out = training_clips(data / "train", config.clips, False, large=large), []
-        trainer = Trainer(out, config, clips, held_out, device, resume)
+        trainer = Trainer(out, config, clips, held_out, device, resume=True)
         with interruptible() as stop:
             finished = trainer.run(stop, progress=progress)
         _wait()  # for the leader, which writes the weights

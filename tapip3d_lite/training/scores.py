@@ -53,7 +53,7 @@ def validate(tracker: Tracker, clips: Sequence[Clip]) -> dict[str, float]:
     """Mean scores on held-out clips in world space, names prefixed by `val_`."""
     was_training = tracker.training
     tracker.eval()
-    scores = mean_scores([evaluate(tracker.track(clip, support_grid=0), clip) for clip in clips])
+    scores = mean_scores([evaluate(tracker.track(clip), clip) for clip in clips])
     tracker.train(was_training)
     names = ("AJ3D_none", "APD3D_none", "OA", "AJ3D_none_dynamic", "APD3D_none_dynamic", "APD3D_none_static")
     return {f"val_{name}": round(scores[name], 4) for name in names}
@@ -62,7 +62,7 @@ def validate(tracker: Tracker, clips: Sequence[Clip]) -> dict[str, float]:
 def calibrate(tracker: Tracker, clips: Sequence[Clip]) -> float:
     """Set the config's visibility threshold to the one of the best mean AJ3D (unscaled) on held-out clips."""
     tracker.eval()
-    tracks = [tracker.track(clip, support_grid=0) for clip in clips]
+    tracks = [tracker.track(clip) for clip in clips]
 
     def score(threshold: float) -> float:
         logit = np.log(threshold / (1 - threshold))

@@ -17,6 +17,7 @@ from torch import nn
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
+from tapip3d_lite.trackers import load_tracker
 from tapip3d_lite.training.augment import augment
 from tapip3d_lite.training.backward import saving_backward
 from tapip3d_lite.training.config import TrainConfig
@@ -72,6 +73,8 @@ class Trainer:
             torch.manual_seed(config.seed)
             self.tracker = Tracker(config.tracker_config()).to(device).train()
             nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
+        if config.init is not None:
+            self._begin_with(config.init)
         self.group, self.step, self.seconds = Group(), 0, 0.0
         self.cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, self.size)
         saved = self.journal.checkpoint(device)
@@ -162,6 +165,18 @@ class Trainer:
         slots = range(self.group.rank * self.config.batch, (self.group.rank + 1) * self.config.batch)
         clips, features = zip(*(self.draw(step, slot) for slot in slots), strict=True)
         return make_batch(list(clips), None if self.config.train_encoder else list(features)).to(self.device)
+
+    def _begin_with(self, name: str) -> None:
+        source = load_tracker(name)
+        if not isinstance(source, Tracker):
+            raise ValueError(f"TrainConfig.init: {name!r} has no parameters; name a weights file or shipped weights")
+        try:
+            self.tracker.load_state_dict(source.state_dict())
+        except RuntimeError as error:
+            raise ValueError(
+                f"TrainConfig.init: {name!r} belongs to a tracker of other sizes than preset {self.config.preset!r} "
+                f"with {self.config.tracker or 'no changes'}: {str(error).splitlines()[-1].strip()}"
+            ) from error
 
     def _one_step(self) -> dict:
         started = time.perf_counter()
