@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.data import FeatureCache
 from tapip3d_lite.training.trainer import Trainer
 
 _WARM = 3  # first steps of a stage that are not timed: they encode clips and warm caches
@@ -25,8 +27,8 @@ def fit_to_time(
 ) -> TrainConfig:
     """The same recipe with as many steps as fit into a time, found by timing a few steps of each stage.
 
-    So the learning rate reaches its end when the time does. Steps of other lengths, evaluations and the first
-    encoding of each clip are not counted: ask for a little less time than there is.
+    So the learning rate reaches its end when the time does. The first encoding of each clip is counted, evaluations
+    and whatever else runs meanwhile are not: ask for a little less time than there is.
 
     Args:
         config: the recipe; its numbers of steps are replaced.
@@ -50,11 +52,25 @@ def fit_to_time(
     trial = replace(config, matching_steps=count if matching else 0, steps=count, validation=0, save_every=10**9)
     lines: list[dict] = []
     with tempfile.TemporaryDirectory() as folder:
-        Trainer(folder, trial, list(clips)[:2], device=device).run(watch=lines.append, progress=False)
+        trainer = Trainer(folder, trial, list(clips)[:2], device=device)
+        trainer.run(watch=lines.append, progress=False)
+        encoding = 0.0 if config.train_encoder else _encoding(trainer, Path(folder) / "again")
     costs = np.diff([0.0] + [line["seconds"] for line in lines])
     cost = {
-        stage: float(np.median([c for c, line in zip(costs, lines, strict=True) if line["stage"] == stage][_WARM:]))
+        stage: float(np.mean([c for c, line in zip(costs, lines, strict=True) if line["stage"] == stage][_WARM:]))
         for stage in {line["stage"] for line in lines}
     }
     first = max(1, round(matching * seconds / cost["matching"])) if matching else 0
-    return replace(config, matching_steps=first, steps=max(1, round((1 - matching) * seconds / cost["tracking"])))
+    left = (1 - matching) * seconds - min(config.clips, len(clips)) * encoding
+    # So little time that not every clip is met: then nearly every step encodes one.
+    steps = max(left / cost["tracking"], (1 - matching) * seconds / (cost["tracking"] + encoding))
+    return replace(config, matching_steps=first, steps=max(1, round(steps)))
+
+
+def _encoding(trainer: Trainer, folder: Path) -> float:
+    """Seconds to encode a clip."""
+    cache = FeatureCache(folder, trainer.tracker.encoder, trainer.size)
+    started = time.perf_counter()
+    for clip in trainer.clips:
+        cache.path(clip)
+    return (time.perf_counter() - started) / len(trainer.clips)

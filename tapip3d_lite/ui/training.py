@@ -148,7 +148,7 @@ async def train_live(
         trainer: as it stands.
         minutes: at most, of wall-clock time.
         zero_motion: see `learning_curve`.
-        every: seconds between two drawings.
+        every: seconds between two drawings, at least; more where drawing would take more than a twentieth of the time.
 
     Returns:
         All lines of the log.
@@ -164,10 +164,13 @@ async def train_live(
         trainer.run, lambda: live.stopped or time.monotonic() > end, live.lines.append, progress=False
     )
     training = asyncio.create_task(run)
+    took = 0.0
     while not training.done():
-        if await _interrupted(training, every):
+        if await _interrupted(training, max(every, 20 * took)):
             live.press()
+        begun = time.monotonic()
         live.draw()
+        took = time.monotonic() - begun
     live.button.disabled = True
     live.draw()
     await training  # raises what went wrong
