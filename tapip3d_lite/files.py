@@ -54,3 +54,8 @@ def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write a compressed npz atomically."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **arrays)
+
+
+def shipped_weights() -> dict[str, Path]:
+    """The weights files that come with the library, by name."""
+    return {path.stem: path for path in (Path(__file__).parent / "weights").glob("*.safetensors")}

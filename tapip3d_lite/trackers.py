@@ -9,9 +9,9 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker
+from tapip3d_lite.files import shipped_weights
 
 _BASELINES = {"static": StaticTracker, "klt": KltTracker}
-_WEIGHTS = Path(__file__).parent / "weights"
 
 
 class TrackerLike(Protocol):
@@ -34,7 +34,7 @@ class TrackerLike(Protocol):
 
 def list_trackers() -> list[str]:
     """Names that `load_tracker` takes: shipped weights first, then the baselines."""
-    return sorted(path.stem for path in _WEIGHTS.glob("*.safetensors")) + list(_BASELINES)
+    return sorted(shipped_weights()) + list(_BASELINES)
 
 
 def load_tracker(name: str | Path = "lite", device: str = "cpu") -> TrackerLike:
@@ -49,8 +49,7 @@ def load_tracker(name: str | Path = "lite", device: str = "cpu") -> TrackerLike:
     """
     if str(name) in _BASELINES:
         return _BASELINES[str(name)]()
-    shipped = _WEIGHTS / f"{name}.safetensors"
-    path = shipped if shipped.exists() else Path(name)
+    path = shipped_weights().get(str(name), Path(name))
     if not path.is_file():
         raise ValueError(
             f"load_tracker: no tracker {str(name)!r}; choose {', '.join(list_trackers())} or a weights file"

@@ -20,7 +20,7 @@ FLOORS = [
     {"training", "evaluation"},
     {"trackers"},
     {"ui"},
-    {"__main__", ""},
+    {"__main__", "commands", ""},
 ]
 
 

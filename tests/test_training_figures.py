@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
+from tapip3d_lite import commands
 from tapip3d_lite.simulate import simulate_dataset
 from tapip3d_lite.training import plan
 from tapip3d_lite.training.config import TrainConfig
@@ -17,7 +18,7 @@ from tapip3d_lite.training.trainer import Trainer
 from tapip3d_lite.ui.augmentations import TITLES, before_and_after, motion_paths
 from tapip3d_lite.ui.exercises.chain import Chain, plain, saving
 from tapip3d_lite.ui.motion import MOVING
-from tapip3d_lite.ui.training import LivePlot, learning_curve, tracks_and_truth, train_live
+from tapip3d_lite.ui.training import LivePlot, learning_curve, learning_curves, tracks_and_truth, train_live
 
 SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
 SIZES |= {"context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2}
@@ -70,6 +71,18 @@ def test_curves_over_minutes_of_a_window_and_of_nothing(lines):
     for wrong in ({"by": "day"}, {"window": 0}):
         with pytest.raises(ValueError, match="learning_curve"):
             learning_curve(lines, **wrong)
+
+
+def test_trainings_have_a_row_each_and_the_command_draws_them(lines, tmp_path):
+    figure = learning_curves([("first", lines), ("second", lines[:2])], window=2)
+    rows = np.reshape(figure.axes, (2, 3))
+    assert [row[0].get_ylabel().splitlines()[0] for row in rows] == ["first", "second"]
+    assert drawn(rows[0, 1]) == drawn(learning_curve(lines, window=2).axes[1]) and not rows[1, 1].lines
+    (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    commands.curves((tmp_path, tmp_path / "log.jsonl"), out=tmp_path / "c.png")
+    assert (tmp_path / "c.png").read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(ValueError, match="no such log"):
+        commands.curves((tmp_path / "none",), out=tmp_path / "d.png")
 
 
 def test_learnt_tracks_stand_beside_the_truth():

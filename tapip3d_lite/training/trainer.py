@@ -15,9 +15,9 @@ import torch
 from torch import nn
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.model.weights import save_weights
-from tapip3d_lite.trackers import load_tracker
+from tapip3d_lite.model.weights import load_weights, save_weights
 from tapip3d_lite.training.augment import augment
 from tapip3d_lite.training.backward import saving_backward
 from tapip3d_lite.training.config import TrainConfig
@@ -167,9 +167,7 @@ class Trainer:
         return make_batch(list(clips), None if self.config.train_encoder else list(features)).to(self.device)
 
     def _begin_with(self, name: str) -> None:
-        source = load_tracker(name)
-        if not isinstance(source, Tracker):
-            raise ValueError(f"TrainConfig.init: {name!r} has no parameters; name a weights file or shipped weights")
+        source = load_weights(shipped_weights().get(name, name))
         try:
             self.tracker.load_state_dict(source.state_dict())
         except RuntimeError as error:

@@ -40,10 +40,40 @@ def learning_curve(
     Raises:
         ValueError: another `by`, or a window of no step.
     """
+    return learning_curves([("", lines)], zero_motion, by, window)
+
+
+def learning_curves(
+    logs: Sequence[tuple[str, Sequence[Line]]],
+    zero_motion: Mapping[str, float] | None = None,
+    by: str = "step",
+    window: int = 100,
+) -> Figure:
+    """The learning curves of several trainings, one row each.
+
+    Args:
+        logs: (name, lines) of each training.
+        zero_motion: see `learning_curve`; of all of them.
+        by: see `learning_curve`.
+        window: see `learning_curve`.
+
+    Raises:
+        ValueError: as `learning_curve`.
+    """
     if by not in ("step", "minutes") or window < 1:
         raise ValueError(f'learning_curve: expected by="step" or "minutes", window >= 1, got {by!r}, {window}')
-    figure = Figure(figsize=(11, 2.9), layout="constrained")
-    axes = figure.subplots(1, 3)
+    figure = Figure(figsize=(11, 2.9 * len(logs)), layout="constrained")
+    rows = figure.subplots(len(logs), 3, squeeze=False)
+    for axes, (name, lines) in zip(rows, logs, strict=True):
+        _row(axes, lines, zero_motion, by, window)
+        if name:
+            axes[0].set_ylabel(f"{name}\n\n{axes[0].get_ylabel()}", fontsize=8)
+    return figure
+
+
+def _row(
+    axes: Sequence[Axes], lines: Sequence[Line], zero_motion: Mapping[str, float] | None, by: str, window: int
+) -> None:
     stages = [[line for line in lines if line["stage"] == name] for name in ("matching", "tracking")]
     _curve(axes[0], stages[0], "right", by, window, INK)
     _curve(axes[1], stages[1], "loss", by, window, INK)
@@ -65,7 +95,6 @@ def learning_curve(
         axes[1].set_yscale("log")
         axes[1].tick_params(which="minor", labelsize=7)
         axes[2].legend(fontsize=7, frameon=False, loc="upper left")
-    return figure
 
 
 def tracks_and_truth(clip: Clip, pred: Tracks, frames: Sequence[int] | None = None) -> Figure:
