@@ -1,4 +1,4 @@
-"""The command line: `python -m tapip3d_lite track IN.npz --tracker klt --out OUT.npz --html OUT.html`.
+"""The command line: `python -m tapip3d_lite track IN.npz --out OUT.npz --html OUT.html`.
 
 Bad input ends with one line on standard error and exit code 2; Ctrl-C with exit code 130.
 """
@@ -23,7 +23,7 @@ from tapip3d_lite.training.config import TrainConfig
 def track(
     clip: Positional[Path],
     /,
-    tracker: Annotated[str, arg(help="a name of `list_trackers()` or a weights file")] = "klt",
+    tracker: Annotated[str, arg(help="a name of `list_trackers()` or a weights file")] = "lite",
     out: Annotated[Path | None, arg(help="result npz in the authors' format")] = None,
     html: Annotated[Path | None, arg(help="3D page with a time slider")] = None,
     png: Annotated[Path | None, arg(help="picture of frames with tracks")] = None,
@@ -59,7 +59,7 @@ def _write(clip: t3d.Clip, result: t3d.Tracks, out: Path | None, html: Path | No
 def evaluate(
     clips: Positional[tuple[Path, ...]],
     /,
-    tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("static", "klt"),
+    tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("lite", "static", "klt"),
     device: str = "cpu",
 ) -> None:
     """Score trackers on clips with true tracks; prints a Markdown table, one row a clip, then the means."""
@@ -79,7 +79,7 @@ def evaluate(
 
 
 def benchmark(
-    tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("static", "klt"),
+    tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("lite", "static", "klt"),
     split: Annotated[tuple[str, ...], arg(help="static-camera, moving-camera, occlusion; default: all")] = (),
     space: Annotated[tuple[str, ...], arg(help="world, camera or both (learnt trackers)")] = ("world",),
     count: Annotated[int | None, arg(help="only the first so many clips of each split")] = None,
@@ -105,7 +105,7 @@ def benchmark(
 def demo(
     clip: Positional[Path] = Path("data_samples/arc.npz"),
     /,
-    tracker: str = "klt",
+    tracker: str = "lite",
     out: Annotated[Path, arg(help="folder for the page and the picture")] = Path("demo_output"),
 ) -> None:
     """Track a sample clip and write a 3D page (HTML) and a picture (PNG)."""
