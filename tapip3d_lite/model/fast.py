@@ -183,7 +183,7 @@ def _key_and_value(attention: Attention) -> tuple[tuple[Tensor, Tensor | None], 
 def _normalised(x: Tensor, eps: float, other: float) -> tuple[Tensor, Tensor]:
     """LayerNorm without gain, and the factor (..., 1) that turns it into the one with another eps."""
     if torch.is_grad_enabled():  # the statistics of native_layer_norm carry no gradient
-        variance = x.var(-1, correction=0, keepdim=True)
+        variance = (x - x.mean(-1, keepdim=True)).square().mean(-1, keepdim=True)  # 4 times sooner than x.var
         return F.layer_norm(x, x.shape[-1:], eps=eps), ((variance + eps) / (variance + other)).sqrt()
     normed, _, inverse = torch.native_layer_norm(x, x.shape[-1:], None, None, eps)
     return normed, (1 + inverse.square() * (other - eps)).rsqrt()
