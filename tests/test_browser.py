@@ -102,15 +102,21 @@ def page(browser):
 
 RUN_ALL = """async seconds => {
     const panel = jupyterapp.shell.currentWidget
-    const late = new Promise((_, fail) => setTimeout(() => fail(`cells still run after ${seconds} s`), 1000 * seconds))
+    const cells = () => Array.from(panel.content.widgets).filter(c => c.model.type === 'code')
+    const prompts = () => cells().map(c => c.inputArea.promptNode.innerText).join(' ')
+    const fail = reject => reject(`cells still run after ${seconds} s: ${prompts()}`)
+    const late = new Promise((_, reject) => setTimeout(fail, 1000 * seconds, reject))
     const run = async () => {
         await panel.context.ready
         await panel.sessionContext.ready
+        // What is asked while the kernel is still being connected may never be answered.
+        const kernel = panel.sessionContext.session.kernel
+        while (kernel.connectionStatus !== 'connected' || kernel.status !== 'idle')
+            await new Promise(resolve => setTimeout(resolve, 100))
         await jupyterapp.commands.execute('notebook:run-all-cells')
     }
     await Promise.race([run(), late])
-    const cells = Array.from(panel.content.widgets).filter(c => c.model.type === 'code')
-    return cells.map(c => [c.model.executionCount, c.model.outputs.toJSON().filter(o => o.output_type === 'error')])
+    return cells().map(c => [c.model.executionCount, c.model.outputs.toJSON().filter(o => o.output_type === 'error')])
 }"""
 
 
