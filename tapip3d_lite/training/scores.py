@@ -69,6 +69,6 @@ def calibrate(tracker: Tracker, clips: Sequence[Clip]) -> float:
         seen = [replace(x, visible=x.visible_logits >= logit) for x in tracks]
         return mean_scores([evaluate(x, clip) for x, clip in zip(seen, clips, strict=True)])["AJ3D_none"]
 
-    best = max(np.arange(0.2, 0.96, 0.05).round(2).tolist(), key=score)
+    best = max([*np.arange(0.2, 0.96, 0.05).round(2).tolist(), 0.97, 0.98, 0.99], key=score)
     tracker.config = replace(tracker.config, visible_threshold=best)
     return best
