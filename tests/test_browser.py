@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -22,7 +23,8 @@ BROWSERS = [
 ]
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
 CHOSEN = [next(FOLDER.glob(f"{number}_*.ipynb")) for number in ("00", "03", "04")]
-SECONDS = 300  # the longest that anything is waited for
+SECONDS = 600  # the longest that anything is waited for
+ALL_SECONDS = 1800  # the longest that all notebooks together may take
 
 pytestmark = [
     pytest.mark.skipif("TAPIP3D_BROWSER" not in os.environ, reason="run by `python3 run.py test --browser`"),
@@ -82,12 +84,25 @@ def address(server, home, seconds=60):
 @pytest.fixture(scope="module")
 def browser():
     playwright = pytest.importorskip("playwright.sync_api", reason="no playwright; `run.py test --browser` installs it")
+    psutil = pytest.importorskip("psutil", reason="no psutil; `run.py test --browser` installs it")
     # WebGL without a graphics card.
     options = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    # A page whose script never returns answers no time limit of its own.
+    watch = threading.Timer(ALL_SECONDS, end_browser, [psutil.Process()])
+    watch.daemon = True
     with playwright.sync_playwright() as play:
         running = play.chromium.launch(executable_path=BROWSER, args=options)
+        watch.start()
         yield running
+        watch.cancel()
         running.close()
+
+
+def end_browser(tests):
+    """Kill what the children of the tests (playwright's driver, JupyterLab) started: the browser and the kernels."""
+    for child in tests.children():
+        for started in child.children():
+            started.kill()
 
 
 @pytest.fixture
