@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.model import encoder as module
 from tapip3d_lite.model import inference
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.contexts import N2N
@@ -172,3 +173,21 @@ def test_memory_hardly_grows_with_the_length_of_a_long_clip(monkeypatch):
     (short, twice), (long, _) = (most_bytes(tracker, small_clip(frames)) for frames in (8, 24))
     assert twice == 16
     assert long - short < 16 * frame / 8
+
+
+def test_the_encoder_takes_as_many_frames_at_once_as_suit_the_machine(monkeypatch):
+    encoder, images = small_tracker().encoder, torch.rand(2, 5, 3, 32, 32)
+    sizes = []
+    encoder.stem.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
+    with torch.no_grad():
+        monkeypatch.setattr(module, "_CPU_PIXELS", 3 * 32 * 32)
+        chunked = encoder(images)
+        encoder.fast = False
+        whole = encoder(images)
+        encoder.fast = True
+        monkeypatch.setattr(module, "_CPU_PIXELS", 1)  # a frame at least
+        single = encoder(images)
+    learning = encoder(images)
+    assert sizes == [3, 3, 3, 1, 10, *[1] * 10, 10]
+    for other in (chunked, single, learning):
+        torch.testing.assert_close(other, whole, rtol=1e-4, atol=1e-4)

@@ -18,7 +18,6 @@ from tapip3d_lite.training.journal import read_log
 from tapip3d_lite.training.matching import MatchingConfig, draw_pair
 from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.sampling import SamplingConfig, load_part
-from tapip3d_lite.training.scores import calibrate
 from tapip3d_lite.training.trainer import Trainer
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
@@ -265,22 +264,3 @@ def test_a_recipe_from_before_a_setting_existed_is_continued(tmp_path, clips):
     (tmp_path / "config.json").write_text(json.dumps(stored))
     assert TrainConfig.from_dict(stored).motion == recipe().motion and not TrainConfig.from_dict(stored).augment
     assert Trainer(tmp_path, recipe(), clips, resume=True).step == 0
-
-
-def test_the_threshold_of_visibility_is_the_one_of_the_best_score(clips):
-    clip = t3d.load_clip(clips[0])
-    sure = torch.logit(torch.tensor([0.961, 0.985])).numpy()  # hidden, visible
-
-    class Sure:
-        config = t3d.TrackerConfig.preset("lite")
-
-        def eval(self):
-            return self
-
-        def track(self, clip):
-            true = clip.tracks
-            return t3d.Tracks(true.xyz, true.visible, clip.queries, sure[true.visible.astype(int)])
-
-    tracker = Sure()
-    assert not clip.tracks.visible.all()
-    assert calibrate(tracker, [clip]) == tracker.config.visible_threshold == 0.97

@@ -38,7 +38,7 @@ def make_tracker(preset: str = "lite", fast: bool = True, **changes: Any) -> Tra
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         tracker = Tracker(TrackerConfig.preset(preset, **changes)).eval()
-    tracker.fast = tracker.neighborhood.fast = fast
+    tracker.fast = tracker.neighborhood.fast = tracker.encoder.fast = fast
     return tracker
 
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from tapip3d_lite.model.config import TrackerConfig
 
 _CHUNK = 16  # frames encoded at once without gradient; frames are independent, so this only bounds memory
+_CPU_PIXELS = 2**18  # and on a CPU their pixels: maps that stay near the cache take less time, too
 
 
 class ResidualBlock(nn.Module):
@@ -34,7 +35,13 @@ class ResidualBlock(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Images to feature maps: four residual stages, resized to one size, concatenated and fused."""
+    """Images to feature maps: four residual stages, resized to one size, concatenated and fused.
+
+    Attributes:
+        fast: encode as many frames at once as suit the machine; False: as many as memory should bear.
+    """
+
+    fast = True
 
     def __init__(self, config: TrackerConfig) -> None:
         super().__init__()
@@ -58,7 +65,12 @@ class Encoder(nn.Module):
             (B, T, C, H // stride, W // stride) float32.
         """
         images = rgb.flatten(0, 1)
-        step = len(images) if torch.is_grad_enabled() else _CHUNK
+        if torch.is_grad_enabled():
+            step = len(images)
+        elif self.fast and images.device.type == "cpu":
+            step = min(_CHUNK, max(1, _CPU_PIXELS // images[0, 0].numel()))
+        else:
+            step = _CHUNK
         features = torch.cat([self._encode(chunk).float() for chunk in images.split(step)])
         return features.unflatten(0, rgb.shape[:2])
 

@@ -51,7 +51,7 @@ class TrainConfig:
     steps: int = 6000
     batch: int = 1
     frames: tuple[int, int] = (8, 16)
-    iterations: tuple[int, int] = (2, 4)
+    iterations: tuple[int, int] = (2, 3)
     short: float = 0.35
     train_encoder: bool = False
     lr: float = 1e-3

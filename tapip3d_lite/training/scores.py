@@ -1,9 +1,8 @@
-"""How well it goes: accuracy on the examples just seen, scores on held-out clips, and the visibility threshold."""
+"""How well it goes: accuracy on the examples just seen, scores on held-out clips."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -57,18 +56,3 @@ def validate(tracker: Tracker, clips: Sequence[Clip]) -> dict[str, float]:
     tracker.train(was_training)
     names = ("AJ3D_none", "APD3D_none", "OA", "AJ3D_none_dynamic", "APD3D_none_dynamic", "APD3D_none_static")
     return {f"val_{name}": round(scores[name], 4) for name in names}
-
-
-def calibrate(tracker: Tracker, clips: Sequence[Clip]) -> float:
-    """Set the config's visibility threshold to the one of the best mean AJ3D (unscaled) on held-out clips."""
-    tracker.eval()
-    tracks = [tracker.track(clip) for clip in clips]
-
-    def score(threshold: float) -> float:
-        logit = np.log(threshold / (1 - threshold))
-        seen = [replace(x, visible=x.visible_logits >= logit) for x in tracks]
-        return mean_scores([evaluate(x, clip) for x, clip in zip(seen, clips, strict=True)])["AJ3D_none"]
-
-    best = max([*np.arange(0.2, 0.96, 0.05).round(2).tolist(), 0.97, 0.98, 0.99], key=score)
-    tracker.config = replace(tracker.config, visible_threshold=best)
-    return best

@@ -27,7 +27,7 @@ from tapip3d_lite.training.matching import draw_pair, matching_loss
 from tapip3d_lite.training.motion import random_coordinates
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.sampling import draw_frames, load_part, sample_tracks
-from tapip3d_lite.training.scores import Accuracy, calibrate, validate
+from tapip3d_lite.training.scores import Accuracy, validate
 
 
 class Trainer:
@@ -250,7 +250,4 @@ class Trainer:
         return done % self.config.evaluate_every == 0 or self.step == self.config.total
 
     def _finish(self) -> None:
-        """Write the weights, with the threshold of visibility that suits the held-out clips."""
-        if self.validation:
-            calibrate(self.tracker, self.validation)
         save_weights(self.tracker, self.journal.folder / "weights.safetensors", half=True)
