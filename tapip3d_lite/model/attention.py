@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+_HIDDEN = 2**21  # floats of an MLP's hidden layer that exist at once: 8 MiB, which stay near a CPU's cores
+
 
 class Attention(nn.Module):
     """Multi-head attention: Out(softmax(q k^T / sqrt(head_dim)) v)."""
@@ -67,7 +69,10 @@ class Block(nn.Module):
         normed = self.norm(x)
         seen = normed if self.norm_context is None else self.norm_context(context)
         x = x + self.attention(normed, seen, mask)
-        return x + self.mlp(self.norm(x))
+        if torch.is_grad_enabled() or x.device.type != "cpu":
+            return x + self.mlp(self.norm(x))
+        rows = x.flatten(0, -2).split(max(1, _HIDDEN // self.mlp[0].out_features))  # on a CPU sooner in less memory
+        return torch.cat([part + self.mlp(self.norm(part)) for part in rows]).view_as(x)
 
 
 class Pool(nn.Module):

@@ -231,7 +231,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "image_size": (128, 128),
         "window": 8,
         "feature_dim": 64,
-        "levels": 3,
+        "stride": 2,  # images are small: features of 4 pixels place a point no better than to 1.3 of them
+        "levels": 4,
         "neighbors": 9,
         "token_dim": 64,
         "context_head_dim": 64,

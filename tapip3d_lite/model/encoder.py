@@ -71,7 +71,12 @@ class Encoder(nn.Module):
             step = min(_CHUNK, max(1, _CPU_PIXELS // images[0, 0].numel()))
         else:
             step = _CHUNK
-        features = torch.cat([self._encode(chunk).float() for chunk in images.split(step)])
+        if step >= len(images):
+            return self._encode(images).float().unflatten(0, rgb.shape[:2])
+        size = (self.head.out_channels, images.shape[2] // self.stride, images.shape[3] // self.stride)
+        features = images.new_empty(len(images), *size, dtype=torch.float32)
+        for chunk, part in zip(images.split(step), features.split(step), strict=True):  # never two copies of them
+            part.copy_(self._encode(chunk))
         return features.unflatten(0, rgb.shape[:2])
 
     def _encode(self, images: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 Stands in for the paper's initialisation from CoTracker3's encoder (section 4, "implementation"). The loss is InfoNCE:
 a point's feature in one frame is compared with every cell of the other, and should prefer the cells where the point
-really is. It costs minutes, and trackers that start from such features leave the zero-motion solution much sooner.
+really is, by as much as tells where between their centres. It costs minutes, and trackers that start from such features leave the zero-motion solution much sooner.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from tapip3d_lite.training.augment import AugmentConfig, augment
 from tapip3d_lite.training.sampling import load_part
 
 _ENOUGH = 16  # points that two frames should share
+_NEAR = 2.5  # cells around the true place among which a point is placed
 
 
 @dataclass(frozen=True)
@@ -30,16 +31,19 @@ class MatchingConfig:
     Attributes:
         points: most points of a pair of frames.
         gap: greatest number of frames between the two.
-        levels: pyramid levels at which features are compared, each weighing a third of the one before.
+        levels: pyramid levels at which features are compared, each weighing half of the one before.
         spread: standard deviation of the target around the true place, in cells.
+        place: weight of the distance, in cells, between the true place and the mean of the cells around it, each
+            weighing as its similarity; it teaches to place a point within a cell.
         jitter: strength of random brightness and contrast, drawn for each frame (without augmentation).
         lr, weight_decay, clip_norm: of AdamW with one cycle.
     """
 
     points: int = 128
     gap: int = 12
-    levels: int = 3
+    levels: int = 4
     spread: float = 0.5
+    place: float = 1.0
     jitter: float = 0.2
     lr: float = 1e-3
     weight_decay: float = 1e-4
@@ -123,7 +127,7 @@ def _two_frames(
 
 
 def matching_loss(encoder: nn.Module, pair: Pair, config: MatchingConfig) -> tuple[Tensor, float]:
-    """InfoNCE over all cells of the other frame.
+    """InfoNCE over all cells of the other frame, and how far off the similar cells near the true place are.
 
     Args:
         encoder: (1, 2, 3, H, W) to (1, 2, C, h, w).
@@ -133,26 +137,34 @@ def matching_loss(encoder: nn.Module, pair: Pair, config: MatchingConfig) -> tup
     Returns:
         The loss, and the share of points whose most similar cell of the finest level lies within 1.5 cells.
     """
-    maps, total, right = encoder(pair.rgb[None])[0], 0.0, 0.0
-    device = pair.uv.device
-    size = torch.tensor([pair.rgb.shape[3], pair.rgb.shape[2]], device=device)
+    maps, total, right = encoder(pair.rgb[None])[0], torch.zeros((), device=pair.uv.device), 0.0
+    size = torch.tensor([pair.rgb.shape[3], pair.rgb.shape[2]], device=pair.uv.device)
     for level in range(config.levels):
         maps = F.avg_pool2d(maps, 2) if level else maps
         height, width = maps.shape[-2:]
-        normed = F.layer_norm(maps.movedim(1, -1), maps.shape[1:2])  # as the tracker's tokens are
-        cells = pair.uv * torch.tensor([width, height], device=device) / size
-        grid = cells[0] / torch.tensor([width - 1, height - 1], device=device) * 2 - 1
-        source = normed[:1].movedim(-1, 1)
-        own = F.grid_sample(source, grid[None, None], align_corners=True, padding_mode="border")[0, :, 0].T  # (N, C)
-        scores = own @ normed[1].flatten(0, 1).T / maps.shape[1] ** 0.5  # (N, h w)
-        u, v = cells[1].unbind(-1)
-        across = torch.exp(-((torch.arange(width, device=device) - u[:, None]) ** 2) / (2 * config.spread**2))
-        down = torch.exp(-((torch.arange(height, device=device) - v[:, None]) ** 2) / (2 * config.spread**2))
-        target = (down[:, :, None] * across[:, None]).flatten(1)
-        target = target / target.sum(1, keepdim=True).clamp(min=1e-9)
-        total = total - (target * scores.log_softmax(-1)).sum(-1).mean() / 3**level
+        if min(height, width) < 2:  # a small image has no more levels
+            break
+        cells = pair.uv * torch.tensor([width, height], device=pair.uv.device) / size
+        scores = _similarity(maps, cells[0])
+        columns, rows = (torch.arange(n, device=pair.uv.device, dtype=torch.float32) for n in (width, height))
+        places = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).flatten(0, 1)  # (h w, 2), row by row
+        apart = (places - cells[1][:, None]).square().sum(-1)  # (N, h w)
+        target = (-apart / (2 * config.spread**2)).softmax(-1)
+        loss = -(target * scores.log_softmax(-1)).sum(-1).mean()
+        if config.place:
+            near = scores.masked_fill(apart > _NEAR**2, -1e4).softmax(-1)
+            loss = loss + config.place * (near @ places - cells[1]).norm(dim=-1).mean()
+        total = total + loss / 2**level
         if level == 0:
-            best = scores.argmax(-1)
-            place = torch.stack([best % width, best // width], -1)
-            right = float(((place - cells[1]).norm(dim=-1) < 1.5).float().mean())
+            right = float((apart.gather(1, scores.argmax(-1)[:, None]) < 1.5**2).float().mean())
     return total, right
+
+
+def _similarity(maps: Tensor, cells: Tensor) -> Tensor:
+    """How alike features at cells (N, 2) of the first map are to every cell of the second; maps (2, C, h, w)."""
+    height, width = maps.shape[-2:]
+    normed = F.layer_norm(maps.movedim(1, -1), maps.shape[1:2])  # as the tracker's tokens are
+    grid = cells / torch.tensor([width - 1, height - 1], device=cells.device) * 2 - 1
+    source = normed[:1].movedim(-1, 1)
+    own = F.grid_sample(source, grid[None, None], align_corners=True, padding_mode="border")[0, :, 0].T  # (N, C)
+    return own @ normed[1].flatten(0, 1).T / maps.shape[1] ** 0.5

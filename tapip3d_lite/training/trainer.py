@@ -15,9 +15,8 @@ import torch
 from torch import nn
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.model.weights import load_weights, save_weights
+from tapip3d_lite.model.weights import save_weights
 from tapip3d_lite.training.augment import augment
 from tapip3d_lite.training.backward import saving_backward
 from tapip3d_lite.training.config import TrainConfig
@@ -28,6 +27,7 @@ from tapip3d_lite.training.motion import random_coordinates
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.sampling import draw_frames, load_part, sample_tracks
 from tapip3d_lite.training.scores import Accuracy, validate
+from tapip3d_lite.training.start import begin_with
 
 
 class Trainer:
@@ -74,7 +74,7 @@ class Trainer:
             self.tracker = Tracker(config.tracker_config()).to(device).train()
             nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
         if config.init is not None:
-            self._begin_with(config.init)
+            begin_with(self.tracker, config.init)
         self.group, self.step, self.seconds = Group(), 0, 0.0
         self.cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, self.size)
         saved = self.journal.checkpoint(device)
@@ -165,16 +165,6 @@ class Trainer:
         slots = range(self.group.rank * self.config.batch, (self.group.rank + 1) * self.config.batch)
         clips, features = zip(*(self.draw(step, slot) for slot in slots), strict=True)
         return make_batch(list(clips), None if self.config.train_encoder else list(features)).to(self.device)
-
-    def _begin_with(self, name: str) -> None:
-        source = load_weights(shipped_weights().get(name, name))
-        try:
-            self.tracker.load_state_dict(source.state_dict())
-        except RuntimeError as error:
-            raise ValueError(
-                f"TrainConfig.init: {name!r} belongs to a tracker of other sizes than preset {self.config.preset!r} "
-                f"with {self.config.tracker or 'no changes'}: {str(error).splitlines()[-1].strip()}"
-            ) from error
 
     def _one_step(self) -> dict:
         started = time.perf_counter()

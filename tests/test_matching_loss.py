@@ -1,0 +1,53 @@
+"""What the encoder's first lesson rewards: the right cell, and the right place within it."""
+
+import torch
+from torch import nn
+
+from tapip3d_lite.training.matching import MatchingConfig, Pair, matching_loss
+
+CELLS, STRIDE, SHIFT = 24, 2, torch.tensor([2.5, -1.0])  # cells by which everything moves
+
+
+class Code(nn.Module):
+    """Features that tell the place on a surface which moves by SHIFT: sinusoids, smooth like a trained encoder's."""
+
+    def __init__(self):
+        super().__init__()
+        self.waves = torch.randn(2, 32, generator=torch.Generator().manual_seed(0))
+
+    def forward(self, rgb):
+        columns, rows = torch.meshgrid(*[torch.arange(CELLS, dtype=torch.float32)] * 2, indexing="xy")
+        places = torch.stack([columns, rows], -1)
+        phases = torch.stack([places, places - SHIFT]) @ self.waves
+        return torch.cat([phases.cos(), phases.sin()], -1).movedim(-1, 1)[None]
+
+
+def lesson(shift, **changes):
+    torch.manual_seed(0)
+    start = (torch.rand(200, 2) * (CELLS - 12) + 6) * STRIDE
+    rgb = torch.zeros(2, 3, CELLS * STRIDE, CELLS * STRIDE)
+    pair = Pair(rgb, torch.stack([start, start + torch.tensor(shift) * STRIDE]))
+    loss, right = matching_loss(Code(), pair, MatchingConfig(**({"levels": 1} | changes)))
+    return float(loss), right
+
+
+def test_the_right_place_costs_least():
+    true = SHIFT.tolist()
+    wrong = [[2.5, -0.5], [2.0, -1.0], [1.5, 0.0], [-3.0, 4.0]]
+    for changes in ({}, {"place": 0.0}, {"levels": 3}):
+        best = lesson(true, **changes)[0]
+        assert all(best < lesson(shift, **changes)[0] for shift in wrong)
+    assert lesson(true)[1] == 1.0 and lesson([-3.0, 4.0])[1] < 0.1
+
+
+def test_half_a_cell_is_told_by_the_mean_of_the_cells_around():
+    def distance(shift):  # what the second term adds
+        return lesson(shift)[0] - lesson(shift, place=0.0)[0]
+
+    true = SHIFT.tolist()
+    assert distance(true) < 0.15
+    assert 0.35 < distance([true[0] + 0.5, true[1]]) < 0.65
+
+
+def test_a_small_image_has_fewer_levels():
+    assert lesson(SHIFT.tolist(), levels=5) == lesson(SHIFT.tolist(), levels=9)
