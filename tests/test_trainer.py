@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -189,6 +190,14 @@ def test_weights_to_start_from(tmp_path, clips):
         Trainer(tmp_path / "third", recipe(**start, tracker=SIZES | {"hidden": 16}), clips)
     with pytest.raises(ValueError, match="static: no such file"):
         Trainer(tmp_path / "fourth", recipe(init="static"), clips)
+
+
+def test_a_disk_without_room_for_the_features_is_told_first(tmp_path, clips, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=3 * 8 * 16 * 16 * 16 * 2 - 1))
+    with pytest.raises(ValueError, match="features of 3 clips take 0.0 GB.*use fewer clips"):
+        Trainer(tmp_path, recipe(), clips)
+    Trainer(tmp_path / "two", recipe(), clips[:2])
+    Trainer(tmp_path / "along", recipe(train_encoder=True), clips)
 
 
 def test_a_folder_holds_one_recipe(tmp_path, clips):

@@ -6,6 +6,9 @@ run that is continued draws what it would have drawn.
 
 from __future__ import annotations
 
+import math
+import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +17,7 @@ import torch
 from torch import Tensor
 
 from tapip3d_lite.clip import Clip, load_clip
-from tapip3d_lite.files import atomic_path
+from tapip3d_lite.files import atomic_path, load_npz
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.encoder import Encoder
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
@@ -129,6 +132,18 @@ class FeatureCache:
 
     def __init__(self, folder: str | Path, encoder: Encoder, size: tuple[int, int]) -> None:
         self.folder, self.encoder, self.size = Path(folder), encoder, size
+
+    def check_room(self, clips: Sequence[Path]) -> None:
+        """ValueError, with the sizes, where the disk is too small for the features of these clips."""
+        maps = self.encoder.head.out_channels * math.prod(side // self.encoder.stride for side in self.size)
+        frames = len(load_npz(clips[0], skip=("video", "tracks", "visible"))["depths"])
+        missing = sum(not (self.folder / f"{clip.stem}.npy").exists() for clip in clips)
+        needed, free = missing * frames * maps * 2, shutil.disk_usage(self.folder.parent).free
+        if needed > free:
+            raise ValueError(
+                f"train: the features of {missing} clips take {needed / 1e9:.1f} GB in {self.folder}, where "
+                f"{free / 1e9:.1f} GB are free; use fewer clips, another folder, or train the encoder along"
+            )
 
     @torch.no_grad()
     def path(self, clip: Path) -> Path:

@@ -62,7 +62,7 @@ class Trainer:
             resume: continue from the folder's checkpoint, if there is one.
 
         Raises:
-            ValueError: no clips; the folder holds a training already (without `resume`) or one of another recipe.
+            ValueError: no clips; the folder holds a training already (without `resume`) or one of another recipe; no room.
         """
         if not clips:
             raise ValueError("Trainer: no training clips; make some with `training_clips` or `simulate`")
@@ -77,6 +77,8 @@ class Trainer:
             begin_with(self.tracker, config.init)
         self.group, self.step, self.seconds = Group(), 0, 0.0
         self.cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, self.size)
+        if not config.train_encoder:
+            self.cache.check_room(self.clips)
         saved = self.journal.checkpoint(device)
         if saved is not None:
             self.tracker.load_state_dict(saved["model"])
