@@ -9,7 +9,7 @@ import torch
 import tyro
 
 import tapip3d_lite as t3d
-from tapip3d_lite.evaluation.benchmark import SPLITS, estimate, save_results, show
+from tapip3d_lite.evaluation.benchmark import SPLITS, difference_table, estimate, save_results, show
 from tapip3d_lite.training.card import model_card
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.motion import MotionConfig
@@ -54,6 +54,8 @@ def test_every_number_comes_from_the_files(folder, results):
         for split in SPLITS:
             row = [show(estimate(results, label, split, m)) for m in ("AJ3D_none", "APD3D_none", "AJ3D", "APD3D", "OA")]
             assert f"| {split} (4) | {label} | {' | '.join(row)} |" in text
+    for other in ("static", "klt"):
+        assert difference_table(results, "lite · world", other, ("AJ3D_none", "APD3D_none", *METRICS[1:5:3])) in text
     assert "stopped at" not in text
     with open(folder / "log.jsonl", "a") as log:
         log.write('{"step": 15, "seconds": 1.0}\n')

@@ -194,7 +194,7 @@ def test_weights_to_start_from(tmp_path, clips):
 
 def test_a_disk_without_room_for_the_features_is_told_first(tmp_path, clips, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=3 * 8 * 16 * 16 * 16 * 2 - 1))
-    with pytest.raises(ValueError, match="features of 3 clips take 0.0 GB.*use fewer clips"):
+    with pytest.raises(ValueError, match=r"features of 3 clips take 0\.0 GB.*use fewer clips"):
         Trainer(tmp_path, recipe(), clips)
     Trainer(tmp_path / "two", recipe(), clips[:2])
     Trainer(tmp_path / "along", recipe(train_encoder=True), clips)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, load_results, summary_table
+from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, difference_table, load_results, summary_table
 from tapip3d_lite.model.weights import load_weights
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.journal import read_log
@@ -60,6 +60,7 @@ def model_card(
         f"--space world camera --out {Path(results).name}\n```",
         "## Scores\n\nMeans with 95 % bootstrap intervals over clips of the Lite benchmark, whose seeds no training can draw.",
         *(f"{title}:\n\n{_table(scores, part)}" for title, part in _PARTS.items()),
+        *_differences(scores, compared, name),
     ]
     return "\n\n".join([*parts, f"## Limits\n\n{_limits(config)}"]) + "\n"
 
@@ -77,6 +78,17 @@ def _table(scores: dict, part: str) -> str:
     return summary_table(scores, tuple(metric + part for metric in METRICS))
 
 
+def _differences(scores: dict, labels: list[str], name: str) -> list[str]:
+    """Where the model's first results and others' are on the same clips: how much better it is, clip by clip."""
+    own = [label for label in labels if label.rpartition(" · ")[0] == name or label == name]
+    others = [label for label in labels if label not in own]
+    if not own or not others:
+        return []
+    metrics = [metric + part for part in ("", "_dynamic") for metric in METRICS[:2]]
+    tables = [difference_table(scores, own[0], other, metrics) for other in others]
+    return ["Differences, paired by clip:", *tables]
+
+
 def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -> str:
     model = load_weights(weights)
     parameters = sum(p.numel() for p in model.parameters())
@@ -84,7 +96,7 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -
     rows = {
         "parameters": f"{parameters / 1e6:.2f} M, file {weights.stat().st_size / 1e6:.2f} MB",
         "model": f"preset `{config.preset}`, images {model.config.image_size[0]}x{model.config.image_size[1]}, window "
-        f"{model.config.window}, K = {model.config.neighbors}, {model.config.levels} levels"
+        f"{model.config.window}, K = {model.config.neighbors}, {model.config.levels} levels from stride {model.config.stride}"
         + (f"; set by hand: {', '.join(f'{k}={v}' for k, v in config.tracker.items())}" if config.tracker else ""),
         "data": f"{config.clips} simulated clips; examples of {_range(config.frames)} frames and {config.sampling.tracks} "
         f"tracks; {'augmented' if config.augment else 'images not augmented'}",
