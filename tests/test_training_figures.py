@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import signal
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -136,20 +138,49 @@ def test_what_was_stopped_goes_on(trainer, monkeypatch):
     assert [line["step"] for line in watched(trainer)] == [1, 2, 3, 4, 5, 6]
 
 
-def test_interrupting_the_kernel_stops_between_two_steps(trainer):
+def test_interrupting_the_kernel_stops_between_two_steps(trainer, monkeypatch):
+    step = trainer._one_step
+
+    def interrupted():
+        if trainer.step == 2:
+            signal.raise_signal(signal.SIGINT)
+        return step()
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(trainer, "_one_step", interrupted)
+    lines = watched(trainer)
+    assert len(lines) == trainer.step == 3 and signal.getsignal(signal.SIGINT) == before
+    assert len((trainer.journal.folder / "log.jsonl").read_text().splitlines()) == 3
+    assert (trainer.journal.folder / "checkpoint.pt").exists()
+
+
+def test_drawing_takes_a_small_share_of_the_time(trainer, monkeypatch):
+    clock, drawings, draw = [0.0], [], LivePlot.draw
+
+    def slow(live):
+        drawings.append(clock[0])
+        clock[0] += 10.0
+        draw(live)
+
+    monkeypatch.setattr("tapip3d_lite.ui.training.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(LivePlot, "draw", slow)
+    step = trainer._one_step
+    monkeypatch.setattr(trainer, "_one_step", lambda: (clock.__setitem__(0, clock[0] + 100.0), step())[1])
+    watched(trainer, minutes=1e6)
+    assert drawings == [0, 110, 420, 630]  # first, after a step, when ten seconds are a twentieth, and last
+
+
+def test_the_button_is_heard_between_two_steps(trainer, monkeypatch):
     async def cell():
-        cell = asyncio.current_task()
-        trainer.group.any = lambda wish: asyncio.run_coroutine_threadsafe(interrupt(cell), loop).result() or wish
-        loop = asyncio.get_running_loop()
-        return await train_live(trainer, 5)
+        training = asyncio.create_task(train_live(trainer, 5))
+        while trainer.step < 2:
+            await asyncio.sleep(0)
+        shown[0].press()
+        return await training
 
-    async def interrupt(cell):
-        cell.cancel()
-        await asyncio.sleep(0.01)
-
-    lines = asyncio.run(cell())
-    assert 1 <= len(lines) <= 2 and trainer.step == len(lines)
-    assert len((trainer.journal.folder / "log.jsonl").read_text().splitlines()) == trainer.step
+    shown, show = [], LivePlot.__init__
+    monkeypatch.setattr(LivePlot, "__init__", lambda live, *args: (shown.append(live), show(live, *args))[1])
+    assert len(asyncio.run(cell())) <= 4
 
 
 def test_what_goes_wrong_while_watched_is_told(trainer, monkeypatch):

@@ -7,7 +7,7 @@ Paper: section 4 and appendix (AdamW, one cycle, clipping, memory-saving backwar
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -110,19 +110,28 @@ class Trainer:
             FloatingPointError: the loss or a gradient is not finite; the batch is saved in the folder.
         """
         with self.journal.bar(self.step, self.config.total, progress and self.group.leads) as bar:
-            while self.step < self.config.total:
-                line = self._one_step()
+            for line in self.steps(stop):
                 bar.show(line)
                 watch(line)
-                halted = self.group.any(stop())
-                if halted or self.step == self.config.total or self.step % self.config.save_every == 0:
-                    self.save()
-                if halted:
-                    break
-        finished = self.step == self.config.total
-        if finished and self.group.leads:
+        return self.step == self.config.total
+
+    def steps(self, stop: Callable[[], bool] = lambda: False) -> Iterator[dict]:
+        """As `run`, one step at a time, for a caller with something else to do between two: yields lines of the log.
+
+        Args:
+            stop: asked when the caller comes back from a step; what there is then is saved.
+
+        Raises:
+            FloatingPointError: see `run`.
+        """
+        halted = False
+        while self.step < self.config.total and not halted:
+            yield self._one_step()
+            halted = self.group.any(stop())
+            if halted or self.step == self.config.total or self.step % self.config.save_every == 0:
+                self.save()
+        if self.step == self.config.total and self.group.leads:
             self._finish()
-        return finished
 
     def save(self) -> None:
         """Write the checkpoint (atomically)."""

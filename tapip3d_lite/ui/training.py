@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,6 +15,7 @@ from matplotlib.figure import Figure
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project
+from tapip3d_lite.training.command import interruptible
 from tapip3d_lite.training.journal import read_log
 from tapip3d_lite.training.trainer import Trainer
 from tapip3d_lite.ui.figures import png_bytes
@@ -138,7 +138,7 @@ class LivePlot:
             zero_motion: see `learning_curve`.
         """
         self.lines, self.zero_motion = list(lines), zero_motion
-        self._pressed, self._begun = threading.Event(), time.monotonic()
+        self._pressed, self._begun = False, time.monotonic()
         # An image, not an Output: programs that run notebooks (nbclient) may wait long for messages that Outputs send.
         self.picture, self.words = widgets.Image(format="png"), widgets.Label()
         self.button = widgets.Button(description="Stop", icon="stop", tooltip="Stop after this step; all is kept")
@@ -148,21 +148,20 @@ class LivePlot:
 
     def press(self) -> None:
         """What the button does."""
-        self._pressed.set()
+        self._pressed = True
         self.button.disabled = True
 
     @property
     def stopped(self) -> bool:
         """Whether the button was pressed."""
-        return self._pressed.is_set()
+        return self._pressed
 
     def draw(self) -> None:
         """Draw all lines now."""
-        lines = list(self.lines)  # another thread may be adding to it
-        self.picture.value = png_bytes(learning_curve(lines, self.zero_motion))
-        if lines:
-            minutes = (time.monotonic() - self._begun) / 60
-            self.words.value = f"{lines[-1]['stage']}, step {lines[-1]['step']}, {minutes:.1f} min"
+        self.picture.value = png_bytes(learning_curve(self.lines, self.zero_motion))
+        if self.lines:
+            last, minutes = self.lines[-1], (time.monotonic() - self._begun) / 60
+            self.words.value = f"{last['stage']}, step {last['step']}, {minutes:.1f} min"
 
 
 async def train_live(
@@ -170,8 +169,9 @@ async def train_live(
 ) -> list[Line]:
     """Train in a notebook's cell, watched: until the end, the time is up, Stop, or "Kernel, Interrupt".
 
-    To be awaited: the training runs in a thread of its own, so that the kernel stays free to hear the button. Whatever
-    ends it, everything is saved, and the same call goes on from there.
+    To be awaited: between two steps the kernel listens to the button. It is the cell's own thread that trains; in
+    another one a step takes twice as long on two cores, as OpenMP then lets its two teams of threads sleep instead of
+    waiting awake. Whatever ends the training, everything is saved, and the same call goes on from there.
 
     Args:
         trainer: as it stands.
@@ -188,31 +188,21 @@ async def train_live(
     log = trainer.journal.folder / "log.jsonl"
     live = LivePlot(read_log(log) if log.exists() else (), zero_motion)
     end = time.monotonic() + 60 * minutes
+    due = time.monotonic() + every
     display(live.box)
-    run = asyncio.to_thread(
-        trainer.run, lambda: live.stopped or time.monotonic() > end, live.lines.append, progress=False
-    )
-    training = asyncio.create_task(run)
-    took = 0.0
-    while not training.done():
-        if await _interrupted(training, max(every, 20 * took)):
-            live.press()
-        begun = time.monotonic()
-        live.draw()
-        took = time.monotonic() - begun
-    live.button.disabled = True
-    live.draw()
-    await training  # raises what went wrong
-    return live.lines
-
-
-async def _interrupted(training: asyncio.Task, seconds: float) -> bool:
-    """Wait, at most until the training is done; whether the kernel was interrupted meanwhile."""
     try:
-        await asyncio.wait({training}, timeout=seconds)
-    except asyncio.CancelledError:  # what "Kernel, Interrupt" makes of a cell that awaits
-        return True
-    return False
+        with interruptible() as interrupted:
+            for line in trainer.steps(lambda: live.stopped or interrupted() or time.monotonic() > end):
+                live.lines.append(line)
+                begun = time.monotonic()
+                if begun > due:
+                    live.draw()
+                    due = time.monotonic() + max(every, 20 * (time.monotonic() - begun))
+                await asyncio.sleep(0.001)
+    finally:
+        live.button.disabled = True
+        live.draw()
+    return live.lines
 
 
 def _curve(
