@@ -126,8 +126,9 @@ def test_model_rows_have_stages_equal_numbers_and_memory():
     assert whole["fast"].values["largest difference"] < 1e-3
     assert whole["fast, bf16"].values["median difference"] > 0
     for way, row in whole.items():
-        parts = sum(r.seconds[0] for r in rows if ":" in r.case and r.way == way)
-        assert parts == pytest.approx(row.seconds[0], rel=0.05)
+        parts = {r.case.split(": ")[1]: r.seconds[0] for r in rows if ":" in r.case and r.way == way}
+        assert 0 < parts.pop(bench.OFFSETS) < parts["context"]
+        assert sum(parts.values()) == pytest.approx(row.seconds[0], rel=0.05)
     if sys.platform.startswith("linux"):
         assert all(row.values["MiB"] > 1 for row in whole.values())
     assert speed(rows).axes[0].patches

@@ -31,6 +31,8 @@ from tapip3d_lite.training.loss import LossConfig, Truth
 
 __all__ = ["PARTS", "Row", "bench", "table"]
 SLOW, FAST, SHORT, COMPILED = "straightforward", "fast", "fast, bf16", "fast, bf16, compiled"
+KEPT = "fast, features kept"  # of the frozen encoder, as `train` does by default
+OFFSETS = "the offsets' MLP, part of context"  # which both ways compute alike
 
 
 def make_tracker(preset: str = "lite", fast: bool = True, **changes: Any) -> Tracker:
@@ -93,12 +95,15 @@ def bench_model(
 def _by_stage(run: Callable, tracker: Tracker, way: str, spent: dict, results: dict) -> None:
     names = {"encoder": "encoder", "k-NN": "neighborhood", "context": "context", "updater": "updater"}
     parts = {stage: getattr(tracker, name) for stage, name in names.items()}
+    inner = {f"offsets {level}": part for level, part in enumerate(tracker.context.embed.offsets)}
     clock = own_clock()
     start = clock()
-    with stages(parts, clock) as seconds:
+    with stages(parts | inner, clock) as seconds:
         results[way] = run()
-    rest = clock() - start - sum(seconds.values())
-    for stage, time in (seconds | {"the rest": rest}).items():
+    total = clock() - start
+    offsets = sum(seconds.pop(name) for name in inner)
+    rest = total - sum(seconds.values())
+    for stage, time in (seconds | {"the rest": rest, OFFSETS: offsets}).items():
         spent.setdefault(stage, {}).setdefault(way, []).append(time)
 
 
@@ -159,12 +164,14 @@ def bench_training(quick: bool = False, rounds: int = 5) -> Iterator[Row]:
     truth = (torch.from_numpy(x)[None] for x in (clip.tracks.xyz, clip.tracks.visible, clip.queries[:, 0].astype(int)))
     truth, queries = Truth(*truth), torch.from_numpy(clip.queries)[None]
 
-    def step(tracker: Tracker) -> None:
+    def step(tracker: Tracker, features: Tensor | None = None) -> None:
         tracker.zero_grad()
-        saving_backward(tracker, frames_from_clip(clip), queries, truth, LossConfig())
+        saving_backward(tracker, frames_from_clip(clip), queries, truth, LossConfig(), features=features)
 
     trackers = {way: make_tracker("lite", way == FAST, image_size=size).train() for way in (SLOW, FAST)}
     runs = {way: partial(step, tracker) for way, tracker in trackers.items()}
+    with torch.no_grad():
+        runs[KEPT] = partial(step, trackers[FAST], trackers[FAST].encoder(frames_from_clip(clip).rgb))
     seconds = side_by_side(runs, rounds, clock=own_clock())
     yield from compared("training step", f"lite, {frames} frames, {count} queries", seconds)
 
