@@ -160,7 +160,9 @@ def test_the_gpu_part_runs_on_any_device(monkeypatch):
 
 def test_the_limits_of_a_device(monkeypatch):
     taken = {"bf16": [4.0, 2.0], "float32": [0.5, 1.0], "copy": [0.25, 0.125]}
-    monkeypatch.setattr(bench, "side_by_side", lambda runs, rounds: {way: taken[way] for way, run in runs.items() if np.isfinite(run())})
+    monkeypatch.setattr(
+        bench, "side_by_side", lambda runs, rounds: {way: taken[way] for way, run in runs.items() if np.isfinite(run())}
+    )
     assert bench._card("cpu", 2, 64) == (2 * 64**3 / 0.5, 16 * 4 * 64**2 / 0.125)
 
 

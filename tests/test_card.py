@@ -48,7 +48,13 @@ def test_every_number_comes_from_the_files(folder, results):
     parameters = sum(p.numel() for p in t3d.load_tracker(folder / "weights.safetensors").parameters())
     expected = [f"{parameters / 1e6:.2f} M", "two cores of a toaster", "4 of matching, 12 of tracking", "2.00 h"]
     expected += ["probability 0.35", "AJ3D 0.432, APD3D 0.543, OA 0.654 at step 16", "AdamW 0.002", "images 32x32"]
-    expected += ["--lr 0.002", "hidden=32", "--sampling.tracks 6", "--tracker static klt lite --space world camera"]
+    expected += [
+        "--lr 0.002",
+        "hidden=32",
+        " hidden 32 ",
+        "--sampling.tracks 6",
+        "--tracker static klt lite --space world camera",
+    ]
     assert not [x for x in expected if x not in text]
     for label in results:
         for split in SPLITS:
@@ -70,7 +76,9 @@ def test_every_number_comes_from_the_files(folder, results):
 def test_the_command_makes_the_recipe_again(folder, preset):
     """The printed options, parsed as the command line does, give the folder's own recipe."""
     motion = MotionConfig(world=0.25, turned=0.0)
-    config = TrainConfig.recipe(preset, frames=(12, 16), train_encoder=True, augment=preset == "lite", motion=motion)
+    changes = {"frames": (12, 16), "train_encoder": True, "augment": preset == "lite", "motion": motion}
+    tracker = {"visible_threshold": 0.5, "neighbors": 12, "context": "p2n", "use_uv": False}
+    config = TrainConfig.recipe(preset, tracker=tracker, **changes)
     (folder / "config.json").write_text(json.dumps(config.to_dict()))
     text = model_card(folder, folder / "bench.json", "x")
     line = next(line for line in text.splitlines() if " train " in line)

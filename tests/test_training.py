@@ -25,10 +25,12 @@ def setting(frames=10, dtype=torch.float32, **changes):
     return clip, tracker, video, torch.from_numpy(clip.queries)[None].to(dtype), truth
 
 
-@pytest.mark.parametrize("form", ["paper", "pixels"])
-def test_step_loss_is_the_loop(form):
+@pytest.mark.parametrize(
+    "options", [{"form": "paper"}, {"form": "pixels"}, {"soften": 2.0}, {"form": "paper", "soften": 1.0, "within": 3.0}]
+)
+def test_step_loss_is_the_loop(options):
     clip, tracker, frames, queries, truth = setting(frames=9)  # one padded frame
-    config = LossConfig(form=form)
+    config, far = LossConfig(**options), 0
     for step in tracker.steps(frames, queries):
         position, visibility = step_loss(step, truth, 2, config)
         a, b, count = 0.0, 0.0, 0
@@ -40,15 +42,21 @@ def test_step_loss_is_the_loop(form):
                 p = clip.tracks.xyz[t, n]
                 z = t3d.geometry.transform(p[None], clip.extrinsics[t])[0, 2]
                 error = np.linalg.norm(step.xyz[0, i, k].detach().numpy() - p) / max(z, 0.1)
-                if form == "pixels":
-                    error *= np.sqrt(clip.intrinsics[t, 0, 0] * clip.intrinsics[t, 1, 1])
+                focal = np.sqrt(clip.intrinsics[t, 0, 0] * clip.intrinsics[t, 1, 1])
+                trusted = not config.within or error * focal < config.within
+                if config.soften:
+                    error = config.soften * np.log(1 + error * focal / config.soften) / focal
+                if config.form == "pixels":
+                    error *= focal
                 probability = 1 / (1 + np.exp(-float(step.logits[0, i, k].detach())))
-                v = clip.tracks.visible[t, n]
+                v = clip.tracks.visible[t, n] and trusted
+                far += clip.tracks.visible[t, n] and not trusted
                 a, count = a + error, count + 1
                 b -= np.log(probability if v else 1 - probability)
         weight = 0.005 * 0.8 ** (1 - step.iteration) / count
         assert float(position.detach()) == pytest.approx(weight * a, rel=1e-4)
         assert float(visibility.detach()) == pytest.approx(weight * 3 * b, rel=1e-4)
+    assert (far > 0) == (config.within > 0)  # so the option could be seen
 
 
 def gradients(run, *arguments, **options):
@@ -132,7 +140,7 @@ def test_training_on_one_clip_reduces_the_loss():
     assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:3])
 
 
-@pytest.mark.parametrize("bad", [{"form": "metres"}, {"visibility": -1.0}, {"discount": 0.0}])
+@pytest.mark.parametrize("bad", [{"form": "metres"}, {"visibility": -1.0}, {"within": -1.0}, {"discount": 0.0}])
 def test_bad_weights(bad):
     with pytest.raises(ValueError, match="LossConfig"):
         LossConfig(**bad)

@@ -143,10 +143,13 @@ class TrackerConfig:
             changes: fields to set differently.
 
         Raises:
-            ValueError: an unknown preset.
+            ValueError: an unknown preset or field.
         """
         if name not in _PRESETS:
             raise ValueError(f"TrackerConfig.preset: expected one of {', '.join(_PRESETS)}, got {name!r}")
+        unknown = sorted(set(changes) - {field.name for field in fields(cls)})
+        if unknown:
+            raise ValueError(f"TrackerConfig.preset: no field {', '.join(unknown)}; see TrackerConfig's attributes")
         return cls(**(_PRESETS[name] | changes))
 
     @property

@@ -132,7 +132,10 @@ def _flags(config: TrainConfig) -> str:
     default, own = TrainConfig.recipe(config.preset).to_dict(), config.to_dict()
     flags = "" if config.preset == "lite" else f" --preset {config.preset}"
     for name, value, usual in _leaves(own, default):
-        if value != usual and name != "tracker":  # the command line knows presets only; the table names the changes
+        if name == "tracker":  # sizes of images are no plain value for the command line; the table names them
+            plain = [f"{k} {v}" for k, v in value.items() if not isinstance(v, list | tuple)]
+            flags += f" --tracker {' '.join(plain)}" if plain else ""
+        elif value != usual:
             flags += (
                 f" --{name.replace('_', '-')} {_words(value)}" if not isinstance(value, bool) else _switch(name, value)
             )

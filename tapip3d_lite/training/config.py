@@ -19,7 +19,7 @@ class TrainConfig:
 
     Attributes:
         preset: of the tracker, `"lite"` or `"paper"`.
-        tracker: fields of the preset to set differently, e.g. `{"context": "p2n"}`.
+        tracker: fields of the preset to set differently, e.g. `{"context": "p2n"}`; `--tracker context p2n`.
         init: weights to start from instead of chance, `"lite"` or a file; usually with `matching_steps=0`.
         clips: number of training clips; the kept features of one take 13 MB.
         matching_steps: steps that teach the encoder alone to match; 0 leaves it random.
@@ -44,7 +44,7 @@ class TrainConfig:
     """
 
     preset: str = "lite"
-    tracker: dict[str, Any] = field(default_factory=dict)
+    tracker: dict[str, bool | int | float | str] = field(default_factory=dict)
     init: str | None = None
     clips: int = 1000
     matching_steps: int = 2500
