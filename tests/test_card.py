@@ -12,6 +12,7 @@ import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.benchmark import SPLITS, difference_table, estimate, save_results, show
 from tapip3d_lite.training.card import model_card
 from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.motion import MotionConfig
 from tests.test_trainer import SIZES, recipe
 
@@ -31,7 +32,7 @@ def results():
 
 @pytest.fixture
 def folder(tmp_path, results):
-    config = recipe(lr=2e-3)
+    config = recipe(lr=2e-3, loss=LossConfig(soften=1.5, within=3))
     (tmp_path / "config.json").write_text(json.dumps(config.to_dict()))
     lines = [{"step": s, "seconds": 450.0 * s} for s in range(1, 17)]
     lines[-1] |= {"val_AJ3D_none": 0.4321, "val_APD3D_none": 0.5432, "val_OA": 0.6543}

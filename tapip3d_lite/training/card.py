@@ -104,10 +104,12 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -
         f"{max(log[-1]['step'] - config.matching_steps, 0)} of tracking, batches of {config.batch} in each process"
         + (f"; stopped at step {log[-1]['step']} of {config.total}" if log[-1]["step"] < config.total else ""),
         "recipe": f"AdamW {config.lr:g}, weight decay {config.weight_decay:g}, one cycle, M = {_range(config.iterations)}, "
-        f"{config.precision}, encoder {'trained along' if config.train_encoder else 'frozen after matching'}, seed {config.seed}",
+        f"{config.precision}, encoder {'trained along' if config.train_encoder else 'frozen after matching'}, seed {config.seed}"
+        + (f"; errors softened from {config.loss.soften:g} pixels on" if config.loss.soften else ""),
         "wall-clock": f"{log[-1]['seconds'] / 3600:.2f} h of steps (evaluations and simulation not counted)",
         "hardware": hardware,
-        "visible from": f"probability {model.config.visible_threshold:g}",
+        "visible from": f"probability {model.config.visible_threshold:g}"
+        + (f" of being seen and within {config.loss.within:g} pixels" if config.loss.within else ""),
     }
     if held_out:
         last = held_out[-1]
