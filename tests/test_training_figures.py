@@ -80,6 +80,8 @@ def test_trainings_have_a_row_each_and_the_command_draws_them(lines, tmp_path):
     rows = np.reshape(figure.axes, (2, 3))
     assert [row[0].get_ylabel().splitlines()[0] for row in rows] == ["first", "second"]
     assert drawn(rows[0, 1]) == drawn(learning_curve(lines, window=2).axes[1]) and not rows[1, 1].lines
+    texts = [[text.get_text() for text in learning_curve(part).axes[0].texts] for part in (lines, lines[2:])]
+    assert texts == [[], ["as it was"]]  # a training that takes its encoder as it finds it
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     commands.curves((tmp_path, tmp_path / "log.jsonl"), out=tmp_path / "c.png")
     assert (tmp_path / "c.png").read_bytes()[:4] == b"\x89PNG"

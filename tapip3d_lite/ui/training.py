@@ -89,6 +89,9 @@ def _row(
     for ax, title, label in zip(axes, titles, labels, strict=True):
         _plot(ax, label, by)
         ax.set_title(title, fontsize=8, color=INK)
+    if stages[1] and not stages[0]:
+        axes[0].text(0.5, 0.5, "as it was", ha="center", color=INK, fontsize=8, transform=axes[0].transAxes)
+        axes[0].set(xticks=[], yticks=[])
     axes[0].set_ylim(0, 1)
     axes[2].set_ylim(0, 1)
     if stages[1]:
