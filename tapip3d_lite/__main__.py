@@ -140,6 +140,10 @@ def train(
     ] = None,
     resume: Annotated[bool, arg(help="continue from the folder's checkpoint, with its recipe")] = False,
     device: Annotated[str, arg(help="cpu or cuda; several processes: torchrun -m tapip3d_lite train …")] = "cpu",
+    workers: Annotated[
+        int | None, arg(help="processes that make examples meanwhile; default: 0 on a CPU, else cores less two")
+    ] = None,
+    compiled: Annotated[bool, arg(help="compile the tracker's parts, for a GPU: slow to start, then faster")] = False,
     measure: Annotated[bool, arg(help="only print where a step's time goes, and what backward keeps (CPU)")] = False,
 ) -> None:
     """Train a tracker on simulated clips, by default by the recipe of --preset (lite or paper); Ctrl-C saves and stops, --resume goes on exactly there."""
@@ -150,7 +154,7 @@ def train(
 
         return print(report(config, (data or out / "clips") / "train"))
     try:
-        finished, text = run(out, config, data, resume, device)
+        finished, text = run(out, config, data, resume, device, workers, compiled)
     except FloatingPointError as error:
         raise ValueError(str(error)) from error
     print(text)

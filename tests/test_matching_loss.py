@@ -27,8 +27,8 @@ def lesson(shift, **changes):
     start = (torch.rand(200, 2) * (CELLS - 12) + 6) * STRIDE
     rgb = torch.zeros(2, 3, CELLS * STRIDE, CELLS * STRIDE)
     pair = Pair(rgb, torch.stack([start, start + torch.tensor(shift) * STRIDE]))
-    loss, right = matching_loss(Code(), pair, MatchingConfig(**({"levels": 1} | changes)))
-    return float(loss), right
+    loss, right = matching_loss(Code(), [pair], MatchingConfig(**({"levels": 1} | changes)))
+    return float(loss), float(right)
 
 
 def test_the_right_place_costs_least():

@@ -146,7 +146,7 @@ def _gradients(rank, size, folder, clips, batch):
         torch.distributed.init_process_group("gloo", init_method=address, rank=rank, world_size=size)
     trainer = Trainer(f"{folder}/{size}_{rank}", recipe(matching_steps=0, batch=batch), clips)
     trainer.optimizer.zero_grad()
-    trainer._track()
+    trainer._track(trainer.example())
     trainer.group.average(trainer.parameters)
     torch.save([p.grad for p in trainer.parameters], f"{folder}/gradients_{size}_{rank}.pt")
     if size > 1:
@@ -232,7 +232,7 @@ def test_the_papers_recipe_takes_a_tiny_step(tmp_path, clips):
     before = {name: p.clone() for name, p in trainer.tracker.named_parameters()}
     assert trainer.run(progress=False)
     matching, tracking = read_log(tmp_path)
-    assert matching["right"] is not None and tracking["loss"] > 0 and trainer.draw(1, 0)[0].size == (32, 48)
+    assert matching["right"] is not None and tracking["loss"] > 0 and trainer.examples.draw(1, 0)[0].size == (32, 48)
     changed = {name.split(".")[0] for name, p in trainer.tracker.named_parameters() if not torch.equal(p, before[name])}
     assert {"encoder", "updater"} <= changed
 
@@ -241,7 +241,9 @@ def test_augmentation_changes_what_is_drawn_only_where_it_is_asked_for(tmp_path,
     options = {"train_encoder": True, "matching_steps": 0}
     plain = Trainer(tmp_path / "plain", recipe(**options), clips)
     changed = Trainer(tmp_path / "changed", recipe(**options, augment=True), clips)
-    different = [not np.array_equal(plain.draw(s, 0)[0].depths, changed.draw(s, 0)[0].depths) for s in range(8)]
+    different = [
+        not np.array_equal(plain.examples.draw(s, 0)[0].depths, changed.examples.draw(s, 0)[0].depths) for s in range(8)
+    ]
     assert sum(different) >= 7
     path, index = clips[0], np.arange(4)
     whole = t3d.load_clip(path)

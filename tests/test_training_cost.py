@@ -45,6 +45,6 @@ def test_parts_add_up_to_the_step(clips, train_encoder):
 def test_time_is_put_where_it_was_spent(clips, monkeypatch):
     from tapip3d_lite.training.trainer import Trainer
 
-    batch = Trainer.batch
-    monkeypatch.setattr(Trainer, "batch", lambda self, step: time.sleep(0.5) or batch(self, step))
+    example = Trainer.example
+    monkeypatch.setattr(Trainer, "example", lambda self: time.sleep(0.5) or example(self))
     assert step_split(recipe(), clips, steps=1, warm=0)["data"] > 0.5

@@ -140,7 +140,7 @@ def _parts(trainer: Trainer) -> Iterator[dict[str, float]]:
     if trainer.config.train_encoder:
         modules["encoder"] = tracker.encoder
     calls = {
-        "data": (trainer, "batch"),
+        "data": (trainer, "example"),
         "windows' support": (tracker, "window"),
         "backward": (torch.Tensor, "backward"),
         "optimiser": (trainer.optimizer, "step"),

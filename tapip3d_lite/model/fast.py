@@ -15,6 +15,7 @@ With several heads attention is general, and the other savings remain.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -56,6 +57,12 @@ class Ready:
         names = [f.name for f in fields(self) if f.name not in ("pair", "pools", "mixed")]
         parts = {name: getattr(self, name) for name in names}
         return replace(self, **{name: part[index] for name, part in parts.items() if part is not None})
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Ready:
+        """The same with other tensors."""
+        pools = tuple(FoldedPool(*(change(getattr(pool, f.name)) for f in fields(pool))) for pool in self.pools)
+        names = [f.name for f in fields(self) if f.name not in ("pair", "pools") and getattr(self, f.name) is not None]
+        return replace(self, pools=pools, **{name: change(getattr(self, name)) for name in names})
 
     def compare(self, context: N2N, index: int, near: Neighbors) -> Tensor:
         """As `N2N.forward`: neighbourhoods (B, S, N, K, ...) to (B, S, N, width)."""

@@ -17,8 +17,10 @@ from tapip3d_lite.model.cloud import Level, Normalizer
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.organized import BlockTree
 
-_BUDGET = 2**24  # distances that exist at once: 64 MiB in float32
+_BUDGET = 2**24  # distances that exist at once: 64 MiB in float32; on a GPU 16 times as many
 _FEW = 2**16  # distances that are computed sooner than a tree is searched
+_RUN = 8  # neighbouring cells that are looked at together
+_INFINITE = int(torch.tensor(torch.inf).view(torch.int32))  # its bits
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class KNearest(nn.Module):
 
     def _search(self, level: Level, queries: Tensor, points: Tensor) -> Tensor:
         valid = level.valid.flatten(0, 1) if self.exclude_invalid else None
-        if self.fast and queries.shape[:2].numel() * points.shape[1] > _FEW:
+        if self.fast and queries.device.type == "cpu" and queries.shape[:2].numel() * points.shape[1] > _FEW:
             if "tree" not in level.memory:
                 level.memory["tree"] = BlockTree.build(level.points.flatten(0, 1), valid)
             if level.memory["tree"] is not None:
@@ -96,8 +98,9 @@ class KNearest(nn.Module):
 
 def gather(values: Tensor, indices: Tensor) -> Tensor:
     """Rows of values (F, P, C) at indices (F, N, K) as (F, N, K, C)."""
-    frame = torch.arange(len(values), device=values.device)[:, None, None]
-    return values[frame, indices]
+    first = torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1]
+    rows = values.flatten(0, 1).index_select(0, (first + indices).flatten())  # its backward needs no sorting on a GPU
+    return rows.view(*indices.shape, values.shape[2])
 
 
 def knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = None) -> Tensor:
@@ -119,33 +122,34 @@ def knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = None
     if count > points.shape[1]:
         raise ValueError(f"knn: asked for {count} neighbours among {points.shape[1]} points; lower neighbors or levels")
     frames, total = points.shape[:2]
-    step = max(1, _BUDGET // (frames * total))
-    chunks = [_nearest(chunk, points, count, valid) for chunk in queries.float().split(step, 1)]
+    step = max(1, _BUDGET * (16 if queries.is_cuda else 1) // (frames * total))
+    queries, points = queries.float(), points.float()
+    chunks = [_nearest(chunk, points, count, valid) for chunk in queries.split(step, 1)]
     return torch.cat(chunks, 1) if chunks else queries.new_zeros((frames, 0, count), dtype=torch.long)
 
 
 def _nearest(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) -> Tensor:
-    distance = squared_distances(queries, points)
+    distance = squared_distances(queries, points)  # (F, N, P)
     if valid is not None:
         distance.masked_fill_(~valid[:, None], torch.inf)
-    near = distance.topk(min(count + 1, points.shape[1]), dim=-1, largest=False)
-    indices = near.indices[..., :count].clone()
-    # topk leaves the order of equal distances open; only rows that contain a tie are searched again.
-    tied = (near.values[..., 1:] == near.values[..., :-1]).any(-1)
-    if bool(tied.any()):
-        indices[tied] = _by_distance_and_index(distance[tied], count)
+    total, indices = distance.shape[-1], torch.arange(distance.shape[-1], device=distance.device)
+    if total % _RUN == 0 and total > 2 * _RUN * count:
+        # The K nearest lie in the K runs of cells whose nearest ones are nearest, ties included: fewer are sorted.
+        runs, _ = _smallest(distance.unflatten(-1, (-1, _RUN)).amin(-1), indices[: total // _RUN], count)
+        indices = (runs.unsqueeze(-1) * _RUN + indices[:_RUN]).flatten(-2)
+        distance = distance.gather(-1, indices)
+    indices, infinite = _smallest(distance, indices, count)
     if valid is not None:
-        chosen = distance.gather(-1, indices)
-        nearest = torch.where(chosen[..., :1].isinf(), 0, indices[..., :1])
-        indices = torch.where(chosen.isinf(), nearest, indices)
+        indices = torch.where(infinite, torch.where(infinite[..., :1], 0, indices[..., :1]), indices)
     return indices
 
 
-def _by_distance_and_index(distance: Tensor, count: int) -> Tensor:
+def _smallest(distance: Tensor, indices: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The indices (F, N, K) of the smallest distances (F, N, P), lowest index first among equals; which are infinite."""
     # The bits of a non-negative float order like the float itself, so one integer holds (distance, index).
-    index = torch.arange(distance.shape[-1], device=distance.device)
-    key = (distance.view(torch.int32).long() << 32) + index
-    return key.topk(count, dim=-1, largest=False).values & 0xFFFFFFFF
+    key = (distance.view(torch.int32).long() << 32) + indices
+    near = key.topk(count, dim=-1, largest=False).values
+    return near & 0xFFFFFFFF, (near >> 32) == _INFINITE
 
 
 def squared_distances(queries: Tensor, points: Tensor) -> Tensor:

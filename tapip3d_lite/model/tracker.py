@@ -5,7 +5,7 @@ Paper: section 3 and figure 2. `Tracker.steps` is the whole method; `forward` an
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -87,6 +87,7 @@ class Tracker(nn.Module):
         depth_roi: tuple[float, float] | None = None,
         features: Tensor | None = None,
         state: State | None = None,
+        share: Callable[[Window], Window] = lambda window: window,
     ) -> Iterator[Step]:
         """Yield every update of every window; the caller may backpropagate each at once (`retain_graph=True`).
 
@@ -99,6 +100,7 @@ class Tracker(nn.Module):
             depth_roi: depths (near, far) that count for the scale; None: all valid ones.
             features: (B, T, C, h, w) from `self.encoder`, if they exist already.
             state: trajectories, which are updated in place; made from the queries if None.
+            share: called with each window before its updates, for a caller that has its own way with what they share.
         """
         config, iterations = self.config, self.config.iterations if iterations is None else iterations
         self._check(frames, iterations)
@@ -116,7 +118,7 @@ class Tracker(nn.Module):
                 continue
             coords, logits = state.initial(start, stop, columns)
             cut = scene.cut(start, stop)
-            window = self.window(cut, [near.pick(columns) for near in support], mask, columns)
+            window = share(self.window(cut, [near.pick(columns) for near in support], mask, columns))
             coords = window.norm.normalize(coords)
             for iteration in range(iterations):
                 # Nothing flows back from one iteration into the one before.
@@ -206,16 +208,17 @@ class Tracker(nn.Module):
         floats = coords.shape[0] * coords.shape[1] * config.neighbors * config.token_dim * 4
         budget = min(_CHUNK, _CPU_CHUNK) if self.fast and coords.device.type == "cpu" else _CHUNK
         step = count if torch.is_grad_enabled() else max(1, budget // floats)
-        ready, chunks = self._ready(window), []
+        ready, chunks = self.ready(window), []
         for rows in (slice(i, i + step) for i in range(0, count, step)):
             outputs = []
-            for i, (level, kept) in enumerate(zip(window.levels, ready, strict=True)):
+            part = ready if step >= count else [kept[:, rows] for kept in ready]
+            for i, (level, kept) in enumerate(zip(window.levels, part, strict=True)):
                 near = self.neighborhood(level, coords[:, :, rows], level.cells(uv[:, :, rows], config.image_size))
-                outputs.append(self.context(i, kept[:, rows], near))
+                outputs.append(self.context(i, kept, near))
             chunks.append(torch.cat(outputs, -1))
         return torch.cat(chunks, 2)
 
-    def _ready(self, window: Window) -> list:
+    def ready(self, window: Window) -> list:
         """What the context remembers of the queries, in its fast form where it has one."""
         if not (self.fast and isinstance(self.context, N2N)):
             return window.kept

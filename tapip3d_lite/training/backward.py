@@ -1,20 +1,24 @@
 """Backpropagation whose memory grows neither with the number of updates nor with the number of windows.
 
 Paper, section 3.5 ("memory"): estimates are detached after every update, so each update's loss reaches back only
-through that update. Its graph can therefore be walked and freed at once. What all updates share is treated as input:
-image features are a leaf that collects their gradients, and the encoder is backpropagated once at the end.
+through that update. Its graph can therefore be walked and freed at once. What several updates share is treated as input:
+tokens of the cloud and of the queries are leaves that collect their gradients until a window is done, image features
+until the end; then what made them is backpropagated, once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from tapip3d_lite.model.fast import Ready
 from tapip3d_lite.model.frames import Frames
-from tapip3d_lite.model.scene import Step
+from tapip3d_lite.model.scene import Step, Window
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
 
@@ -45,20 +49,51 @@ def saving_backward(
         `position` and `visibility`, the two parts of the loss, and their sum `loss`.
     """
     features = tracker.encoder(frames.rgb) if features is None else features
-    leaf = features.detach().requires_grad_(features.requires_grad)
-    totals, iterations = [0.0, 0.0], options.get("iterations") or tracker.config.iterations
-    for step in tracker.steps(frames, queries, features=leaf, **options):
+    whole, window = Leaves(), Leaves()
+    leaf = whole.of(features)
+    iterations, totals = options.get("iterations") or tracker.config.iterations, []
+    for step in tracker.steps(frames, queries, features=leaf, share=partial(window.shared, tracker), **options):
         parts = step_loss(step, truth, iterations, config)
-        # What updates share (tokens of the cloud, the support) is walked again by the next one, so it must stay; the
-        # update's own graph goes with the last reference to its results.
-        sum(parts).backward(retain_graph=True)
-        totals = [total + float(part.detach()) for total, part in zip(totals, parts, strict=True)]
+        sum(parts).backward()
+        if step.iteration == iterations - 1:
+            window.backward(retain_graph=True)  # the queries' neighbourhoods also serve the next window
+        totals.append(torch.stack(parts).detach())  # read only at the end: asking a GPU for a number waits for it
         if watch is not None:
             watch(step)
         del step, parts
-    if leaf.grad is not None:
-        features.backward(leaf.grad)
-    return {"loss": sum(totals), "position": totals[0], "visibility": totals[1]}
+    whole.backward()
+    return _told(totals)
+
+
+class Leaves:
+    """Stand-ins for tensors, which collect gradients until it is worth going back further."""
+
+    def __init__(self) -> None:
+        self._pairs: list[tuple[Tensor, Tensor]] = []
+
+    def of(self, tensor: Tensor) -> Tensor:
+        """A leaf with the values of a tensor; the tensor itself if no gradient flows through it."""
+        if not tensor.requires_grad:
+            return tensor
+        leaf = tensor.detach().requires_grad_()
+        self._pairs.append((tensor, leaf))
+        return leaf
+
+    def shared(self, tracker: Tracker, window: Window) -> Window:
+        """The window with leaves for all that its updates share."""
+        ready = tracker.ready(window)
+        window = replace(window, levels=[replace(x, features=self.of(x.features)) for x in window.levels], ready={})
+        if isinstance(ready[0], Ready):
+            window.ready[True] = [level.map(self.of) for level in ready]
+            return window
+        return replace(window, kept=[self.of(level) for level in ready])
+
+    def backward(self, retain_graph: bool = False) -> None:
+        """Send what was collected back to where the tensors come from, and begin anew."""
+        pairs = [(tensor, leaf.grad) for tensor, leaf in self._pairs if leaf.grad is not None]
+        self._pairs = []
+        if pairs:
+            torch.autograd.backward(*zip(*pairs, strict=True), retain_graph=retain_graph)
 
 
 def plain_backward(
@@ -68,9 +103,11 @@ def plain_backward(
     iterations = options.get("iterations") or tracker.config.iterations
     steps = tracker.steps(frames, queries, features=tracker.encoder(frames.rgb), **options)
     parts = [torch.stack(step_loss(step, truth, iterations, config)) for step in steps]
-    if not parts:
-        return {"loss": 0.0, "position": 0.0, "visibility": 0.0}
-    total = torch.stack(parts).sum(0)
-    total.sum().backward()
-    position, visibility = total.detach().tolist()
+    if parts:
+        torch.stack(parts).sum().backward()
+    return _told([part.detach() for part in parts])
+
+
+def _told(parts: list[Tensor]) -> dict[str, float]:
+    position, visibility = torch.stack(parts).sum(0).tolist() if parts else (0.0, 0.0)
     return {"loss": position + visibility, "position": position, "visibility": visibility}

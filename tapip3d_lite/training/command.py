@@ -19,7 +19,14 @@ from tapip3d_lite.training.trainer import Trainer
 
 
 def train(
-    out: Path, config: TrainConfig, data: Path | None, resume: bool, device: str, progress: bool = True
+    out: Path,
+    config: TrainConfig,
+    data: Path | None,
+    resume: bool,
+    device: str,
+    workers: int | None = None,
+    compiled: bool = False,
+    progress: bool = True,
 ) -> tuple[bool, str]:
     """Run one training in a folder.
 
@@ -29,6 +36,8 @@ def train(
         data: folder of the clips, shared by trainings; `out / "clips"` if None. Missing clips are simulated.
         resume: continue.
         device: `"cpu"` or `"cuda"`.
+        workers: see `Trainer`; None: none on a CPU, which they would take from training, else cores less two.
+        compiled: see `Trainer`.
         progress: show bars.
 
     Returns:
@@ -41,6 +50,12 @@ def train(
     if resume and recipe.exists():
         config = TrainConfig.from_dict(json.loads(recipe.read_text()))
     data = Path(out) / "clips" if data is None else Path(data)
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("train: torch sees no CUDA device; leave --device out to train on the CPU")
+    if workers is None:
+        workers = (
+            0 if device == "cpu" else max(1, (os.cpu_count() or 2) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)) - 2)
+        )
     large = config.tracker_config().image_size > (128, 128)
     with _processes(device) as leads:
         progress = progress and leads
@@ -51,7 +66,7 @@ def train(
         _wait()
         if not leads:
             clips, held_out = training_clips(data / "train", config.clips, False, large=large), []
-        trainer = Trainer(out, config, clips, held_out, device, resume=True)
+        trainer = Trainer(out, config, clips, held_out, device, True, workers, compiled)
         with interruptible() as stop:
             finished = trainer.run(stop, progress=progress)
         _wait()  # for the leader, which writes the weights

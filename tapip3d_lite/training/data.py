@@ -74,7 +74,7 @@ class Batch:
     """B clips of equal length with their truth.
 
     Attributes:
-        frames: (B, T); colours are left out (empty) where features are given.
+        frames: (B, T), with colours as bytes until `to` has brought them to a device; black where features are given.
         queries: (B, N, 4).
         truth: of the same tracks.
         dynamic: (B, N) bool, points on bodies that move in the world.
@@ -92,13 +92,13 @@ class Batch:
     names: tuple[str, ...]
 
     def to(self, device: torch.device | str) -> Batch:
-        """The batch on another device."""
+        """The batch on a device, ready to be tracked."""
+        frames = self.frames.to(device)
+        frames = replace(frames, rgb=frames.rgb.float() / 255)
         truth = Truth(*(x.to(device) for x in (self.truth.xyz, self.truth.visible, self.truth.times)))
         features = None if self.features is None else self.features.to(device).float()
         roi = tuple(x.to(device) for x in self.roi)
-        return Batch(
-            self.frames.to(device), self.queries.to(device), truth, self.dynamic.to(device), roi, features, self.names
-        )
+        return Batch(frames, self.queries.to(device), truth, self.dynamic.to(device), roi, features, self.names)
 
 
 def make_batch(clips: list[Clip], features: list[Tensor] | None = None) -> Batch:
@@ -108,8 +108,11 @@ def make_batch(clips: list[Clip], features: list[Tensor] | None = None) -> Batch
         clips: with tracks, at the model's image size.
         features: of each clip (T, C, h, w), if they exist.
     """
-    parts = [frames_from_clip(clip) for clip in clips]
-    frames = Frames(*(torch.cat([getattr(x, name) for x in parts]) for name in Frames.__dataclass_fields__))
+    video, *others = (
+        torch.from_numpy(np.stack([getattr(clip, name) for clip in clips]))
+        for name in ("video", "depths", "intrinsics", "extrinsics")
+    )
+    frames = Frames(video.movedim(-1, 2), *others)
     tracks = [clip.tracks for clip in clips]
     queries = torch.stack([torch.from_numpy(x.queries) for x in tracks])
     xyz, visible = (torch.stack([torch.from_numpy(getattr(x, name)) for x in tracks]) for name in ("xyz", "visible"))

@@ -7,6 +7,7 @@ really is, by as much as tells where between their centres. It costs minutes, an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +30,7 @@ class MatchingConfig:
     """How the encoder is taught to match.
 
     Attributes:
+        pairs: of frames, a step (of each process).
         points: most points of a pair of frames.
         gap: greatest number of frames between the two.
         levels: pyramid levels at which features are compared, each weighing half of the one before.
@@ -39,6 +41,7 @@ class MatchingConfig:
         lr, weight_decay, clip_norm: of AdamW with one cycle.
     """
 
+    pairs: int = 1
     points: int = 128
     gap: int = 12
     levels: int = 4
@@ -126,18 +129,26 @@ def _two_frames(
         gap = max(gap // 2, 1)
 
 
-def matching_loss(encoder: nn.Module, pair: Pair, config: MatchingConfig) -> tuple[Tensor, float]:
+def matching_loss(encoder: nn.Module, pairs: Sequence[Pair], config: MatchingConfig) -> tuple[Tensor, Tensor]:
     """InfoNCE over all cells of the other frame, and how far off the similar cells near the true place are.
 
     Args:
-        encoder: (1, 2, 3, H, W) to (1, 2, C, h, w).
-        pair: two frames.
+        encoder: (P, 2, 3, H, W) to (P, 2, C, h, w).
+        pairs: P times two frames.
         config: levels and their target.
 
     Returns:
-        The loss, and the share of points whose most similar cell of the finest level lies within 1.5 cells.
+        The loss, and the share of points whose most similar cell of the finest level lies within 1.5 cells; means over
+        pairs.
     """
-    maps, total, right = encoder(pair.rgb[None])[0], torch.zeros((), device=pair.uv.device), 0.0
+    maps = encoder(torch.stack([pair.rgb for pair in pairs]))
+    with torch.autocast(maps.device.type, enabled=False):
+        losses = [_pair_loss(two, pair, config) for two, pair in zip(maps, pairs, strict=True)]
+    return tuple(torch.stack(values).mean() for values in zip(*losses, strict=True))
+
+
+def _pair_loss(maps: Tensor, pair: Pair, config: MatchingConfig) -> tuple[Tensor, Tensor]:
+    total = right = torch.zeros((), device=pair.uv.device)
     size = torch.tensor([pair.rgb.shape[3], pair.rgb.shape[2]], device=pair.uv.device)
     for level in range(config.levels):
         maps = F.avg_pool2d(maps, 2) if level else maps
@@ -156,7 +167,7 @@ def matching_loss(encoder: nn.Module, pair: Pair, config: MatchingConfig) -> tup
             loss = loss + config.place * (near @ places - cells[1]).norm(dim=-1).mean()
         total = total + loss / 2**level
         if level == 0:
-            right = float((apart.gather(1, scores.argmax(-1)[:, None]) < 1.5**2).float().mean())
+            right = (apart.gather(1, scores.argmax(-1)[:, None]) < 1.5**2).float().mean()
     return total, right
 
 

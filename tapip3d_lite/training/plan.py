@@ -54,7 +54,7 @@ def fit_to_time(
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(folder, trial, list(clips)[:2], device=device)
         trainer.run(watch=lines.append, progress=False)
-        encoding = 0.0 if config.train_encoder else _encoding(trainer, Path(folder) / "again")
+        encoding = 0.0 if config.train_encoder or device != "cpu" else _encoding(trainer, Path(folder) / "again")
     costs = np.diff([0.0] + [line["seconds"] for line in lines])
     cost = {
         stage: float(np.mean([c for c, line in zip(costs, lines, strict=True) if line["stage"] == stage][_WARM:]))
@@ -69,8 +69,9 @@ def fit_to_time(
 
 def _encoding(trainer: Trainer, folder: Path) -> float:
     """Seconds to encode a clip."""
-    cache = FeatureCache(folder, trainer.tracker.encoder, trainer.size)
+    clips = trainer.examples.clips
+    cache = FeatureCache(folder, trainer.tracker.encoder, trainer.examples.size)
     started = time.perf_counter()
-    for clip in trainer.clips:
+    for clip in clips:
         cache.path(clip)
-    return (time.perf_counter() - started) / len(trainer.clips)
+    return (time.perf_counter() - started) / len(clips)

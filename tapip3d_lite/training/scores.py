@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
+from torch import Tensor
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.evaluation.evaluate import RASTER, evaluate, mean_scores
@@ -21,7 +21,7 @@ class Accuracy:
     """APD3D of the last update of every window, over visible points from their query on; all and dynamic ones."""
 
     def __init__(self) -> None:
-        self.totals = np.zeros((2, 2))  # (inside, counted) x (all, dynamic)
+        self.totals: Tensor | float = 0.0  # (inside, counted) x (all, dynamic)
 
     @torch.no_grad()
     def add(self, step: Step, batch: Batch, iterations: int) -> None:
@@ -38,21 +38,23 @@ class Accuracy:
         focal = (frames.intrinsics[..., 0, 0] * frames.intrinsics[..., 1, 1]).sqrt() * (RASTER / min(frames.size))
         pixels = (step.xyz - target).norm(dim=-1) / depth * focal[..., None]
         inside = torch.stack([(pixels < k).float() for k in _THRESHOLDS]).mean(0)
-        for column, mask in enumerate((counted, counted & batch.dynamic[:, None, step.columns])):
-            self.totals[:, column] += float((inside * mask).sum()), float(mask.sum())
+        masks = torch.stack([counted, counted & batch.dynamic[:, None, step.columns]])
+        sums = torch.stack([inside * masks, masks.float()]).flatten(2).sum(-1)
+        self.totals = self.totals + sums  # read only at the end: asking a GPU for a number waits for it
 
     def result(self) -> dict[str, float | None]:
         """`apd` and `apd_dynamic`, None where nothing was to be seen."""
-        inside, counted = self.totals
+        inside, counted = self.totals.tolist() if isinstance(self.totals, Tensor) else ([0, 0], [0, 0])
         names = ("apd", "apd_dynamic")
-        return {name: float(inside[i] / counted[i]) if counted[i] else None for i, name in enumerate(names)}
+        return {name: inside[i] / counted[i] if counted[i] else None for i, name in enumerate(names)}
 
 
 def validate(tracker: Tracker, clips: Sequence[Clip]) -> dict[str, float]:
     """Mean scores on held-out clips in world space, names prefixed by `val_`."""
     was_training = tracker.training
     tracker.eval()
-    scores = mean_scores([evaluate(tracker.track(clip), clip) for clip in clips])
+    with torch.compiler.set_stance("force_eager"):  # held-out clips differ in shape from what parts are compiled for
+        scores = mean_scores([evaluate(tracker.track(clip), clip) for clip in clips])
     tracker.train(was_training)
     names = ("AJ3D_none", "APD3D_none", "OA", "AJ3D_none_dynamic", "APD3D_none_dynamic", "APD3D_none_static")
     return {f"val_{name}": round(scores[name], 4) for name in names}

@@ -17,15 +17,13 @@ from torch import nn
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
-from tapip3d_lite.training.augment import augment
 from tapip3d_lite.training.backward import saving_backward
 from tapip3d_lite.training.config import TrainConfig
-from tapip3d_lite.training.data import Batch, FeatureCache, make_batch
+from tapip3d_lite.training.data import Batch, FeatureCache
+from tapip3d_lite.training.examples import Examples
 from tapip3d_lite.training.journal import Journal
-from tapip3d_lite.training.matching import draw_pair, matching_loss
-from tapip3d_lite.training.motion import random_coordinates
+from tapip3d_lite.training.matching import Pair, matching_loss
 from tapip3d_lite.training.parallel import Group
-from tapip3d_lite.training.sampling import draw_frames, load_part, sample_tracks
 from tapip3d_lite.training.scores import Accuracy, validate
 from tapip3d_lite.training.start import begin_with
 
@@ -33,12 +31,12 @@ from tapip3d_lite.training.start import begin_with
 class Trainer:
     """Trains a tracker in a folder.
 
-    The folder holds `config.json`, `log.jsonl` (one line a step), `checkpoint.pt`, `features/` of the frozen encoder,
-    and at the end `weights.safetensors`. Whatever step s draws depends on the seed and s alone, so a continued run
-    goes where an undisturbed one would have gone.
+    The folder holds `config.json`, `log.jsonl` (one line a step), `checkpoint.pt`, `features/` of the frozen encoder
+    (on a CPU; a GPU encodes anew sooner), and at the end `weights.safetensors`.
 
     Attributes:
         tracker: what is trained.
+        examples: what it is trained on, by step.
         step: steps done, of both stages together.
     """
 
@@ -50,6 +48,8 @@ class Trainer:
         validation: Sequence[Clip] = (),
         device: str = "cpu",
         resume: bool = False,
+        workers: int = 0,
+        compiled: bool = False,
     ) -> None:
         """Start a training, or take it up again.
 
@@ -60,14 +60,15 @@ class Trainer:
             validation: held-out clips.
             device: `"cpu"` or `"cuda"`.
             resume: continue from the folder's checkpoint, if there is one.
+            workers: processes that make examples while this one trains, for a GPU that would wait for them.
+            compiled: let torch compile the tracker's parts: minutes at first, then each step takes a fraction (GPU).
 
         Raises:
             ValueError: no clips; the folder holds a training already (without `resume`) or one of another recipe; no room.
         """
         if not clips:
             raise ValueError("Trainer: no training clips; make some with `training_clips` or `simulate`")
-        self.config, self.clips, self.validation, self.device = config, list(clips), list(validation), device
-        self.size = config.tracker_config().image_size
+        self.config, self.validation, self.device, self.workers = config, list(validation), device, workers
         self.journal = Journal(folder, config, resume)
         with torch.random.fork_rng():  # the caller's chance is not ours
             torch.manual_seed(config.seed)
@@ -76,13 +77,18 @@ class Trainer:
         if config.init is not None:
             begin_with(self.tracker, config.init)
         self.group, self.step, self.seconds = Group(), 0, 0.0
-        self.cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, self.size)
-        if not config.train_encoder:
-            self.cache.check_room(self.clips)
+        cache = None
+        if not config.train_encoder and device == "cpu":
+            size = config.tracker_config().image_size
+            cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, size)
+            cache.check_room(clips)
+        self.examples, self._coming = Examples(config, clips, self.group.rank, cache), None
         saved = self.journal.checkpoint(device)
         if saved is not None:
             self.tracker.load_state_dict(saved["model"])
             self.step, self.seconds = saved["step"], saved["seconds"]
+        if compiled:
+            _compile(self.tracker)
         self._enter_stage(saved)
 
     @property
@@ -145,43 +151,18 @@ class Trainer:
             }
             self.journal.save(state)
 
-    def lengths(self, step: int) -> tuple[int, int]:
-        """Frames and iterations M of a step, the same in all processes."""
-        config, rng = self.config, np.random.default_rng([self.config.seed, step])
-        if step - config.matching_steps < config.short * config.steps:
-            return config.frames[0], config.iterations[0]
-        half = config.tracker_config().window // 2
-        frames = rng.choice(np.arange(config.frames[0], config.frames[1] + 1, half))
-        return int(frames), int(rng.integers(config.iterations[0], config.iterations[1] + 1))
-
-    def draw(self, step: int, slot: int) -> tuple[Clip, torch.Tensor | None]:
-        """The clip of one slot of a step's batch, and its features if the encoder is frozen."""
-        config, rng = self.config, np.random.default_rng([self.config.seed, step, slot])
-        path, wanted = self.clips[rng.integers(len(self.clips))], self.lengths(step)[0]
-        chosen = np.zeros(0, int)
-
-        def choose(available: int) -> np.ndarray:
-            nonlocal chosen
-            chosen = draw_frames(rng, available, wanted, config.sampling.backward)
-            return chosen
-
-        clip = load_part(path, choose, config.train_encoder, self.size)
-        if config.augment:
-            clip = augment(clip, rng, config.augmentation)
-        clip = random_coordinates(sample_tracks(clip, rng, config.sampling), rng, config.motion)
-        return clip, None if config.train_encoder else self.cache.frames(path, chosen)
-
-    def batch(self, step: int) -> Batch:
-        """This process's share of a step's clips."""
-        slots = range(self.group.rank * self.config.batch, (self.group.rank + 1) * self.config.batch)
-        clips, features = zip(*(self.draw(step, slot) for slot in slots), strict=True)
-        return make_batch(list(clips), None if self.config.train_encoder else list(features)).to(self.device)
+    def example(self) -> list[Pair] | Batch:
+        """What the next step looks at."""
+        if self._coming is None:
+            self._coming = self.examples.stream(self.step, self.workers)
+        return next(self._coming)
 
     def _one_step(self) -> dict:
         started = time.perf_counter()
         self.optimizer.zero_grad()
         line = {"step": self.step + 1, "stage": "matching" if self.matching else "tracking"}
-        line |= self._match() if self.matching else self._track()
+        example = self.example()
+        line |= self._match(example) if self.matching else self._track(example)
         self.group.average(self.parameters)
         norm = float(nn.utils.clip_grad_norm_(self.parameters, self._clip_norm))
         if not np.isfinite([line["loss"], norm]).all():
@@ -200,20 +181,19 @@ class Trainer:
             self.journal.write(line)
         return line
 
-    def _match(self) -> dict:
-        rng = np.random.default_rng([self.config.seed, self.step, self.group.rank])
-        path, augmentation = self.clips[rng.integers(len(self.clips))], self.config.augmentation
-        pair = draw_pair(path, rng, self.config.matching, self.size, augmentation if self.config.augment else None)
-        self._drawn = {"rgb": pair.rgb, "uv": pair.uv}
-        loss, right = matching_loss(self.tracker.encoder, pair.to(self.device), self.config.matching)
+    def _match(self, pairs: list[Pair]) -> dict:
+        self._drawn = {"rgb": [pair.rgb for pair in pairs], "uv": [pair.uv for pair in pairs]}
+        pairs = [pair.to(self.device) for pair in pairs]
+        with self._precision():
+            loss, right = matching_loss(self.tracker.encoder, pairs, self.config.matching)
         loss.backward()
-        return {"loss": float(loss.detach()), "right": right}
+        return {"loss": float(loss.detach()), "right": float(right)}
 
-    def _track(self) -> dict:
-        batch, accuracy, iterations = self.batch(self.step), Accuracy(), self.lengths(self.step)[1]
+    def _track(self, batch: Batch) -> dict:
+        batch, accuracy, iterations = batch.to(self.device), Accuracy(), self.examples.lengths(self.step)[1]
         self._drawn = {"names": batch.names, "queries": batch.queries, "truth": vars(batch.truth)}
         options = {"iterations": iterations, "depth_roi": batch.roi, "features": batch.features}
-        with torch.autocast(self.device, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
+        with self._precision():
             totals = saving_backward(
                 self.tracker,
                 batch.frames,
@@ -224,6 +204,9 @@ class Trainer:
                 **options,
             )
         return totals | accuracy.result()
+
+    def _precision(self) -> torch.autocast:
+        return torch.autocast(self.device, torch.bfloat16, enabled=self.config.precision == "bfloat16")
 
     def _enter_stage(self, saved: dict | None) -> None:
         """Choose what is trained, and make its optimiser."""
@@ -238,7 +221,7 @@ class Trainer:
         decayed = [p for p in self.parameters if p.ndim >= 2]
         groups = [{"params": decayed, "weight_decay": recipe.weight_decay}, {"params": plain, "weight_decay": 0.0}]
         steps = config.matching_steps if self.matching else config.steps
-        self.optimizer = torch.optim.AdamW(groups, recipe.lr)
+        self.optimizer = torch.optim.AdamW(groups, recipe.lr, fused=self.device != "cpu" or None)
         self.schedule = torch.optim.lr_scheduler.OneCycleLR(
             self.optimizer, recipe.lr, total_steps=steps + 1, pct_start=config.warmup
         )
@@ -252,3 +235,13 @@ class Trainer:
 
     def _finish(self) -> None:
         save_weights(self.tracker, self.journal.folder / "weights.safetensors", half=True)
+
+
+def _compile(tracker: Tracker) -> None:
+    from torch._dynamo import config as dynamo
+    from torch._functorch import config as functorch
+
+    functorch.donated_buffer = False  # what updates share is walked backward once for each
+    dynamo.recompile_limit = 64  # each level and length is compiled for itself
+    for part in (tracker.encoder, tracker.neighborhood, tracker.context, tracker.updater):
+        part.compile(dynamic=False)
