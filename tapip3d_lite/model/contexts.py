@@ -122,7 +122,7 @@ class N2N(Context):
     def forward(self, index: int, kept: Tensor, near: Neighbors) -> Tensor:
         """See `Context.forward`; `kept` may also be what `fast.get_ready` made of it, for the same result sooner."""
         if not isinstance(kept, Tensor):
-            return kept.compare(self, index, near)
+            return kept.compare(near)
         context = near.features + self.embed.offset(index, near.offsets)  # (B, S, N, K, D)
         lead = context.shape[:3]
         kept = kept[:, None].expand(*lead, *kept.shape[2:])

@@ -20,7 +20,7 @@ from dataclasses import dataclass, fields, replace
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from tapip3d_lite.model.attention import Attention, Block, Pool
 from tapip3d_lite.model.contexts import N2N, PairAttention
@@ -31,10 +31,11 @@ from tapip3d_lite.model.neighbors import Neighbors
 class Ready:
     """What one level of a window knows of its queries and weights; takes the place of `kept` in `N2N.forward`.
 
-    M = K + 1. Everything but `pair` and `pools` starts with (B, N) and is cut by indexing.
+    M = K + 1. Everything but `pair`, `offsets` and `pools` starts with (B, N) and is cut by indexing.
 
     Attributes:
         pair: the weights.
+        offsets: embeds the context's offsets.
         pools: the folded ends of the two blocks.
         support: (B, N, M, D) tokens, with one head plus the constant part of what attention adds to them.
         query: (B, N, D), the query's own feature if it is appended.
@@ -45,6 +46,7 @@ class Ready:
     """
 
     pair: PairAttention
+    offsets: nn.Module
     pools: tuple[FoldedPool, FoldedPool]
     support: Tensor
     query: Tensor | None = None
@@ -54,20 +56,24 @@ class Ready:
     mixed: Tensor | None = None
 
     def __getitem__(self, index: tuple) -> Ready:
-        names = [f.name for f in fields(self) if f.name not in ("pair", "pools", "mixed")]
+        names = [f.name for f in fields(self) if f.name not in ("pair", "offsets", "pools", "mixed")]
         parts = {name: getattr(self, name) for name in names}
         return replace(self, **{name: part[index] for name, part in parts.items() if part is not None})
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Ready:
         """The same with other tensors."""
         pools = tuple(FoldedPool(*(change(getattr(pool, f.name)) for f in fields(pool))) for pool in self.pools)
-        names = [f.name for f in fields(self) if f.name not in ("pair", "pools") and getattr(self, f.name) is not None]
+        names = [
+            f.name
+            for f in fields(self)
+            if f.name not in ("pair", "offsets", "pools") and getattr(self, f.name) is not None
+        ]
         return replace(self, pools=pools, **{name: change(getattr(self, name)) for name in names})
 
-    def compare(self, context: N2N, index: int, near: Neighbors) -> Tensor:
+    def compare(self, near: Neighbors) -> Tensor:
         """As `N2N.forward`: neighbourhoods (B, S, N, K, ...) to (B, S, N, width)."""
         # Tracks before frames: then each track's static matrix meets all its frames in one product.
-        offsets = context.embed.offset(index, near.offsets.transpose(1, 2))
+        offsets = self.offsets(near.offsets.transpose(1, 2))
         tokens = _precise(offsets + near.features.transpose(1, 2)).contiguous()  # (B, N, S, K, D)
         bags = self._several_heads(tokens) if self.scores is None else self._one_head(tokens)
         out = sum(pool(block, bag) for pool, block, bag in zip(self.pools, _blocks(self.pair), bags, strict=True))
@@ -113,13 +119,14 @@ def get_ready(context: N2N, kept: list[Tensor]) -> list[Ready]:
 
 
 def _ready(context: N2N, index: int, kept: Tensor) -> Ready:
-    pair, query = context.pairs[index % len(context.pairs)], None
+    pair, offsets = context.pairs[index % len(context.pairs)], context.embed.offsets[index % len(context.embed.offsets)]
+    query = None
     if context.use_features:
         kept, query = kept[..., :-1, :], kept[..., -1, :]
     first, second = _blocks(pair)
     pools = FoldedPool.of(pair.pool_support, first), FoldedPool.of(pair.pool_context, second)
     if first.attention.heads > 1:
-        return Ready(pair, pools, kept, query)
+        return Ready(pair, offsets, pools, kept, query)
     gain, shift = first.norm_context.weight, first.norm_context.bias
     (to_key, _), (to_value, value_bias) = _key_and_value(first.attention)
     out = first.attention.to_out
@@ -131,7 +138,7 @@ def _ready(context: N2N, index: int, kept: Tensor) -> Ready:
     to_query = second.attention.to_q
     scores = torch.cat([looks, keys @ to_query.weight], -2).transpose(-1, -2).contiguous()
     bias = (keys @ to_query.bias).unsqueeze(-2)
-    return Ready(pair, pools, kept + constant, query, scores, bias, second.attention.to_out(values), mixed)
+    return Ready(pair, offsets, pools, kept + constant, query, scores, bias, second.attention.to_out(values), mixed)
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.constants import constant
 
 DEGREES = tuple(range(-2, 14))
+_SCALES = tuple(2.0**degree for degree in DEGREES)
 FACTOR = 1 + 2 * len(DEGREES)  # outputs per input
 
 
@@ -29,7 +31,7 @@ def fourier(x: Tensor) -> Tensor:
     Returns:
         (..., 33 d).
     """
-    scales = 2.0 ** torch.tensor(DEGREES, dtype=x.dtype, device=x.device)
+    scales = constant(_SCALES, x)
     angles = (x.unsqueeze(-2) * scales[:, None]).flatten(-2)  # (..., 16 d)
     return torch.cat([x, torch.sin(torch.cat([angles, angles + math.pi / 2], -1))], -1)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from tapip3d_lite.model.constants import constant
 from tapip3d_lite.model.fourier import FACTOR, fourier
 
 
@@ -38,7 +39,7 @@ def trajectory_tokens(
     motion = torch.cat([torch.cat([step, still], 1), torch.cat([still, -step], 1)], -1)
     parts = [logits.unsqueeze(-1), evidence.to(coords.dtype), fourier(motion)]
     if uv is not None:
-        sides = torch.tensor([size[1], size[0]], dtype=uv.dtype, device=uv.device)
+        sides = constant((float(size[1]), float(size[0])), uv)
         # Points far outside the image would otherwise drive the Fourier features with arbitrary phases.
         parts.append(fourier(torch.minimum(torch.maximum(uv, -2 * sides), 2 * sides) / (sides - 1)))
     return torch.cat(parts, -1) + time[:, None]

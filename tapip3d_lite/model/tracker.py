@@ -16,6 +16,7 @@ from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.model import inference
 from tapip3d_lite.model.cloud import Normalizer, feature_cloud
 from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.constants import constant
 from tapip3d_lite.model.contexts import N2N
 from tapip3d_lite.model.encoder import Encoder
 from tapip3d_lite.model.fast import get_ready
@@ -190,7 +191,7 @@ class Tracker(nn.Module):
         pixels = uv if self.config.use_uv else None
         tokens = trajectory_tokens(coords, logits, evidence, pixels, frames.size, self.time)
         delta = self.updater(tokens, window.active).to(coords.dtype)
-        moves = delta.new_tensor(getattr(window.scene.space, "moves", (1.0, 1.0, 1.0)))
+        moves = constant(tuple(getattr(window.scene.space, "moves", (1.0, 1.0, 1.0))), delta)
         return coords + delta[..., :3] * moves, logits + delta[..., 3]
 
     def evidence(self, window: Window, coords: Tensor, uv: Tensor) -> Tensor:

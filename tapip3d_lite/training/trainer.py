@@ -15,6 +15,8 @@ import torch
 from torch import nn
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.model.attention import Block
+from tapip3d_lite.model.contexts import N2N, P2N
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
 from tapip3d_lite.training.backward import saving_backward
@@ -241,7 +243,11 @@ def _compile(tracker: Tracker) -> None:
     from torch._dynamo import config as dynamo
     from torch._functorch import config as functorch
 
-    functorch.donated_buffer = False  # what updates share is walked backward once for each
-    dynamo.recompile_limit = 64  # each level and length is compiled for itself
-    for part in (tracker.encoder, tracker.neighborhood, tracker.context, tracker.updater):
+    dynamo.recompile_limit = 64  # levels differ in size
+    functorch.donated_buffer = False  # the queries' neighbourhoods are walked backward once for each window
+    parts = [tracker.encoder, tracker.neighborhood, tracker.context]
+    parts += [part for part in tracker.updater.modules() if isinstance(part, Block)]  # alike, so compiled once for all
+    if isinstance(tracker.context, N2N | P2N):
+        parts.append(tracker.context.embed.norm)  # of whole feature maps, by `prepare`
+    for part in parts:
         part.compile(dynamic=False)
