@@ -51,3 +51,14 @@ def test_half_a_cell_is_told_by_the_mean_of_the_cells_around():
 
 def test_a_small_image_has_fewer_levels():
     assert lesson(SHIFT.tolist(), levels=5) == lesson(SHIFT.tolist(), levels=9)
+
+
+def test_several_pairs_cost_the_mean_of_what_each_costs():
+    torch.manual_seed(0)
+    encoder = nn.Sequential(nn.Flatten(0, 1), nn.Conv2d(3, 12, STRIDE, STRIDE, bias=False), nn.Unflatten(0, (-1, 2)))
+    rgb, uv = torch.randn(3, 3, CELLS * STRIDE, CELLS * STRIDE), torch.randint(CELLS, (3, 40, 2)) * float(STRIDE)
+    pairs = [Pair(rgb[:1].repeat(2, 1, 1, 1), uv[:1, :5].repeat(2, 1, 1)), Pair(rgb[1:], uv[1:])]  # easy, impossible
+    config = MatchingConfig(levels=2)
+    easy, impossible = (torch.stack(matching_loss(encoder, [pair], config)) for pair in pairs)
+    assert easy[0] < impossible[0] - 1 and easy[1] > 0.5 > impossible[1]
+    torch.testing.assert_close(torch.stack(matching_loss(encoder, pairs, config)), (easy + impossible) / 2)

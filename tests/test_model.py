@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from tapip3d_lite.model.attention import Attention, Block, Pool
 from tapip3d_lite.model.cloud import Level, Normalizer, feature_cloud, nearest_exact, quantile_roi
 from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.constants import _constant, constant
 from tapip3d_lite.model.contexts import N2N, PairAttention
 from tapip3d_lite.model.fourier import DEGREES, fourier, time_embedding
 from tapip3d_lite.model.neighbors import KNearest, Neighbors, knn
@@ -189,6 +190,17 @@ def test_trajectory_token_layout(rng):
         pixel = torch.tensor([2 * 48 / 47, 10 / 31])  # clamped to twice the width
         parts = [logits[0, t, n][None], evidence[0, t, n], fourier(torch.cat([following, previous])), fourier(pixel)]
         assert torch.allclose(token[t, n], torch.cat(parts), atol=2e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_constants_first_used_without_training_serve_training(dtype):
+    _constant.cache_clear()
+    x = torch.ones(2, dtype=dtype, requires_grad=True)
+    with torch.inference_mode():
+        first = constant((3.0, 4.0), torch.ones(1, dtype=dtype))
+    assert constant((3.0, 4.0), x) is first and first.dtype == dtype  # so the same one serves both
+    (x * first).sum().backward()
+    assert x.grad.tolist() == first.tolist() == [3.0, 4.0]
 
 
 # --- attention ----------------------------------------------------------------------------------------------------

@@ -22,7 +22,8 @@ class Level:
         features: (B, T, h, w, C).
         points: (B, T, h, w, 3) in the trajectory's space.
         valid: (B, T, h, w) bool, whether the cell's depth is known.
-        extra: anything that a context's `prepare` adds for its neighbourhood (e.g. feature planes).
+        extra: anything that a context's `prepare` adds for its neighbourhood, e.g. feature planes; tensors with gradient
+            in it stand in lists, tuples or dicts, where the memory-saving backward finds them.
         memory: what neighbourhoods made of the points, e.g. a search tree; copies with other points start empty.
     """
 
@@ -75,7 +76,7 @@ def feature_cloud(features: Tensor, points: Tensor, valid: Tensor, levels: int) 
 
 def nearest_exact(source: int, target: int, device: torch.device) -> Tensor:
     """Indices (target,) of the source pixels nearest to the centres of target cells, rounded as torch's float32 does."""
-    scale = torch.tensor(source / target, dtype=torch.float32, device=device)
+    scale = float(np.float32(source / target))
     index = ((torch.arange(target, dtype=torch.float32, device=device) + 0.5) * scale).floor().long()
     return index.clamp(max=source - 1)
 
@@ -95,7 +96,9 @@ class Normalizer:
     scale: float
 
     @classmethod
-    def fit(cls, points: Tensor, valid: Tensor, mode: str = "isotropic", scale: float = 1.0) -> Normalizer:
+    def fit(
+        cls, points: Tensor, valid: Tensor, mode: str = "isotropic", scale: float = 1.0, check: bool = True
+    ) -> Normalizer:
         """Statistics of the valid points of a window.
 
         Args:
@@ -103,6 +106,7 @@ class Normalizer:
             valid: (B, S, H, W) bool: depth known and inside the region of interest.
             mode: `"isotropic"`: one std over points and axes; `"anisotropy"`: one an axis; `"none"`: identity.
             scale: wanted standard deviation.
+            check: for a valid point, which a GPU has to be waited for.
 
         Raises:
             ValueError: no valid point in a window.
@@ -112,7 +116,7 @@ class Normalizer:
             return cls(points.new_zeros(batch, 1, 1, 3), points.new_ones(batch, 1, 1, 1), 1.0)
         weight = valid.flatten(1).unsqueeze(-1)  # (B, P, 1)
         count = weight.sum(1, keepdim=True)
-        if not bool((count > 0).all()):
+        if check and not bool((count > 0).all()):
             raise ValueError(
                 "depths: a window has no valid point inside depth_roi, so coordinates have no scale; widen depth_roi"
             )

@@ -43,9 +43,12 @@ class Tracker(nn.Module):
     Attributes:
         fast: compute N2N by `fast.Ready`, which gives the same numbers as the clear form in `contexts` sooner, in
             pieces that fit a CPU's cache.
+        steady: do the same operations whatever the values are, without checking them: every track joins every window,
+            masked where it does not belong. Then nothing waits for a GPU, and a CUDA graph can hold a whole step.
     """
 
     fast: bool = True
+    steady: bool = False
 
     def __init__(self, config: TrackerConfig) -> None:
         super().__init__()
@@ -109,12 +112,12 @@ class Tracker(nn.Module):
             return
         space, half = fitted(make_space(space or self.space), frames), config.window // 2
         features = self.encoder(frames.rgb) if features is None else features
-        state = State.start(queries, frames, space, half) if state is None else state
+        state = State.start(queries, frames, space, half, not self.steady) if state is None else state
         scene = self.scene(frames, features, space, depth_roi)
         support = self.support(scene, queries, state.queries)
         for stop in window_ends(len(scene.frames), config.window):
             start = stop - config.window
-            columns, mask = state.members(stop, active)
+            columns, mask = state.members(stop, active, self.steady)
             if not len(columns):
                 continue
             coords, logits = state.initial(start, stop, columns)
@@ -166,12 +169,15 @@ class Tracker(nn.Module):
             active: (B, n) bool, tracks that exist.
             columns: (n,) which of all tracks these are; only looked at from outside.
         """
-        norm = Normalizer.fit(scene.points, scene.valid, self.config.norm_mode, self.config.norm_scale)
+        config = self.config
+        norm = Normalizer.fit(scene.points, scene.valid, config.norm_mode, config.norm_scale, not self.steady)
         cloud = [replace(level, points=norm.normalize(level.points)) for level in scene.levels]
         levels = [self.context.prepare(i, level) for i, level in enumerate(cloud)]
         support = [near.normalized(norm) for near in support]
         kept = [self.context.describe(i, near) for i, near in enumerate(support)]
-        return Window(scene, norm, levels, kept, None if bool(active.all()) else active, columns, support)
+        if not self.steady and bool(active.all()):
+            active = None
+        return Window(scene, norm, levels, kept, active, columns, support)
 
     def update(self, window: Window, coords: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
         """Update the trajectories of one window once (equation 1).

@@ -36,14 +36,14 @@ class State:
     times: Tensor
 
     @classmethod
-    def start(cls, queries: Tensor, frames: Frames, space: Any, multiple: int) -> State:
-        """Trajectories that stand still at their queries (B, N, 4), given in the world."""
+    def start(cls, queries: Tensor, frames: Frames, space: Any, multiple: int, check: bool = True) -> State:
+        """Trajectories that stand still at their queries (B, N, 4), given in the world; `check` their frames or not."""
         if queries.ndim != 3 or queries.shape[0] != len(frames.depths) or queries.shape[2] != 4:
             raise ValueError(
                 f"queries: expected ({len(frames.depths)}, N, 4) rows (t, x, y, z), got {tuple(queries.shape)}"
             )
         times = queries[..., 0].long()
-        if bool(((times < 0) | (times >= len(frames))).any()):
+        if check and bool(((times < 0) | (times >= len(frames))).any()):
             raise ValueError(
                 f"queries: t must be in [0, {len(frames) - 1}], got {int(times.min())}..{int(times.max())}"
             )
@@ -55,14 +55,16 @@ class State:
         still = coords[:, None].expand(-1, count, -1, -1).clone()
         return cls(still, still.new_zeros(still.shape[:3]), coords, times)
 
-    def members(self, stop: int, active: Tensor | None) -> tuple[Tensor, Tensor]:
+    def members(self, stop: int, active: Tensor | None, all_columns: bool = False) -> tuple[Tensor, Tensor]:
         """Tracks of the window that ends before frame `stop`: those queried before it.
 
         Returns:
-            columns (n,), the tracks that any batch element has, and active (B, n) bool, which really exist.
+            columns (n,), the tracks that any batch element has, or all; and active (B, n) bool, which really exist.
         """
         inside = self.times < stop
         inside = inside if active is None else inside & active
+        if all_columns:
+            return torch.arange(inside.shape[1], device=inside.device), inside
         columns = inside.any(0).nonzero()[:, 0]
         return columns, inside[:, columns]
 

@@ -23,7 +23,12 @@ from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
 
 
-def saving_backward(
+def saving_backward(tracker: Tracker, *arguments: Any, **options: Any) -> dict[str, float]:
+    """As `add_gradients`; returns `position` and `visibility`, the two parts of the loss, and their sum `loss`."""
+    return losses(add_gradients(tracker, *arguments, **options))
+
+
+def add_gradients(
     tracker: Tracker,
     frames: Frames,
     queries: Tensor,
@@ -32,7 +37,7 @@ def saving_backward(
     features: Tensor | None = None,
     watch: Callable[[Step], None] | None = None,
     **options: Any,
-) -> dict[str, float]:
+) -> Tensor:
     """Add the gradients of the whole loss to the parameters, one update at a time.
 
     Args:
@@ -46,7 +51,7 @@ def saving_backward(
         options: of `Tracker.steps`, e.g. `active`, `iterations`, `space`.
 
     Returns:
-        `position` and `visibility`, the two parts of the loss, and their sum `loss`.
+        (2,) the position and visibility parts of the loss, without gradient.
     """
     features = tracker.encoder(frames.rgb) if features is None else features
     whole, window = Leaves(), Leaves()
@@ -57,12 +62,18 @@ def saving_backward(
         sum(parts).backward()
         if step.iteration == iterations - 1:
             window.backward(retain_graph=True)  # the queries' neighbourhoods also serve the next window
-        totals.append(torch.stack(parts).detach())  # read only at the end: asking a GPU for a number waits for it
+        totals.append(torch.stack(parts).detach())
         if watch is not None:
             watch(step)
         del step, parts
     whole.backward()
-    return _told(totals)
+    return torch.stack(totals).sum(0) if totals else queries.new_zeros(2)
+
+
+def losses(parts: Tensor) -> dict[str, float]:
+    """Names for what `add_gradients` returns; asking a GPU for numbers waits for it."""
+    position, visibility = parts.tolist()
+    return {"loss": position + visibility, "position": position, "visibility": visibility}
 
 
 class Leaves:
@@ -82,11 +93,19 @@ class Leaves:
     def shared(self, tracker: Tracker, window: Window) -> Window:
         """The window with leaves for all that its updates share."""
         ready = tracker.ready(window)
-        window = replace(window, levels=[replace(x, features=self.of(x.features)) for x in window.levels], ready={})
+        levels = [replace(x, features=self.of(x.features), extra=self._all(x.extra)) for x in window.levels]
+        window = replace(window, levels=levels, ready={})
         if isinstance(ready[0], Ready):
             window.ready[True] = [level.map(self.of) for level in ready]
             return window
         return replace(window, kept=[self.of(level) for level in ready])
+
+    def _all(self, extra: Any) -> Any:
+        if isinstance(extra, list | tuple):
+            return type(extra)(map(self._all, extra))
+        if isinstance(extra, dict):
+            return {name: self._all(value) for name, value in extra.items()}
+        return self.of(extra) if isinstance(extra, Tensor) else extra
 
     def backward(self, retain_graph: bool = False) -> None:
         """Send what was collected back to where the tensors come from, and begin anew."""
@@ -103,11 +122,7 @@ def plain_backward(
     iterations = options.get("iterations") or tracker.config.iterations
     steps = tracker.steps(frames, queries, features=tracker.encoder(frames.rgb), **options)
     parts = [torch.stack(step_loss(step, truth, iterations, config)) for step in steps]
+    total = torch.stack(parts).sum(0) if parts else queries.new_zeros(2)
     if parts:
-        torch.stack(parts).sum().backward()
-    return _told([part.detach() for part in parts])
-
-
-def _told(parts: list[Tensor]) -> dict[str, float]:
-    position, visibility = torch.stack(parts).sum(0).tolist() if parts else (0.0, 0.0)
-    return {"loss": position + visibility, "position": position, "visibility": visibility}
+        total.sum().backward()
+    return losses(total.detach())

@@ -66,6 +66,8 @@ def train(
         _wait()
         if not leads:
             clips, held_out = training_clips(data / "train", config.clips, False, large=large), []
+        if device == "cuda" and config.precision == "bfloat16":
+            torch.set_float32_matmul_precision("high")  # TF32, for what is left in float32
         trainer = Trainer(out, config, clips, held_out, device, True, workers, compiled)
         with interruptible() as stop:
             finished = trainer.run(stop, progress=progress)

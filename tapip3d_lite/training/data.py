@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -93,12 +93,20 @@ class Batch:
 
     def to(self, device: torch.device | str) -> Batch:
         """The batch on a device, ready to be tracked."""
-        frames = self.frames.to(device)
-        frames = replace(frames, rgb=frames.rgb.float() / 255)
-        truth = Truth(*(x.to(device) for x in (self.truth.xyz, self.truth.visible, self.truth.times)))
-        features = None if self.features is None else self.features.to(device).float()
-        roi = tuple(x.to(device) for x in self.roi)
-        return Batch(frames, self.queries.to(device), truth, self.dynamic.to(device), roi, features, self.names)
+        batch = self.map(lambda x: x.to(device))
+        features = None if batch.features is None else batch.features.float()
+        rgb = batch.frames.rgb
+        rgb = rgb.float() / 255 if rgb.dtype == torch.uint8 else rgb
+        return replace(batch, frames=replace(batch.frames, rgb=rgb), features=features)
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Batch:
+        """The batch with every tensor changed, always in the same order."""
+        frames, truth = (
+            type(part)(*(change(getattr(part, f.name)) for f in fields(part))) for part in (self.frames, self.truth)
+        )
+        features = None if self.features is None else change(self.features)
+        roi = tuple(change(x) for x in self.roi)
+        return Batch(frames, change(self.queries), truth, change(self.dynamic), roi, features, self.names)
 
 
 def make_batch(clips: list[Clip], features: list[Tensor] | None = None) -> Batch:

@@ -89,16 +89,20 @@ class Examples(Dataset):
         return make_batch(list(clips), None if self.cache is None else list(features))
 
     def stream(self, first: int, workers: int = 0) -> Iterator[list[Pair] | Batch]:
-        """The examples of step `first` and all after it, in order.
+        """The examples of step `first` and the others of its stage, in order.
+
+        A stage ends the stream: what the next one is made of may depend on what this one teaches the encoder.
 
         Args:
             first: step.
             workers: processes that make the next ones meanwhile; 0: each is made when it is asked for.
         """
+        matching = self.config.matching_steps
+        steps = range(first, matching if first < matching else len(self))
         if not workers:
-            return (self[step] for step in range(first, len(self)))
-        steps = range(first, len(self))
-        return iter(DataLoader(self, None, sampler=steps, num_workers=workers, worker_init_fn=_leave_interrupts))
+            return (self[step] for step in steps)
+        own = {"generator": torch.Generator(), "worker_init_fn": _leave_interrupts}  # the caller's chance is not ours
+        return iter(DataLoader(self, None, sampler=steps, num_workers=workers, **own))
 
 
 def _share(rank: int, count: int) -> range:

@@ -20,8 +20,8 @@ _THRESHOLDS = (1, 2, 4, 8, 16)  # pixels of the benchmark's raster
 class Accuracy:
     """APD3D of the last update of every window, over visible points from their query on; all and dynamic ones."""
 
-    def __init__(self) -> None:
-        self.totals: Tensor | float = 0.0  # (inside, counted) x (all, dynamic)
+    def __init__(self, device: torch.device | str = "cpu") -> None:
+        self.totals = torch.zeros(2, 2, device=device)  # (inside, counted) x (all, dynamic)
 
     @torch.no_grad()
     def add(self, step: Step, batch: Batch, iterations: int) -> None:
@@ -40,11 +40,12 @@ class Accuracy:
         inside = torch.stack([(pixels < k).float() for k in _THRESHOLDS]).mean(0)
         masks = torch.stack([counted, counted & batch.dynamic[:, None, step.columns]])
         sums = torch.stack([inside * masks, masks.float()]).flatten(2).sum(-1)
-        self.totals = self.totals + sums  # read only at the end: asking a GPU for a number waits for it
+        self.totals += sums  # read only at the end: asking a GPU for a number waits for it
 
-    def result(self) -> dict[str, float | None]:
-        """`apd` and `apd_dynamic`, None where nothing was to be seen."""
-        inside, counted = self.totals.tolist() if isinstance(self.totals, Tensor) else ([0, 0], [0, 0])
+    @staticmethod
+    def result(totals: Tensor) -> dict[str, float | None]:
+        """`apd` and `apd_dynamic` of `totals`, None where nothing was to be seen."""
+        inside, counted = totals.tolist()
         names = ("apd", "apd_dynamic")
         return {name: inside[i] / counted[i] if counted[i] else None for i, name in enumerate(names)}
 

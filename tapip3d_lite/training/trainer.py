@@ -12,20 +12,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.model.attention import Block
-from tapip3d_lite.model.contexts import N2N, P2N
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
-from tapip3d_lite.training.backward import saving_backward
+from tapip3d_lite.training.backward import add_gradients, losses
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.data import Batch, FeatureCache
 from tapip3d_lite.training.examples import Examples
 from tapip3d_lite.training.journal import Journal
 from tapip3d_lite.training.matching import Pair, matching_loss
 from tapip3d_lite.training.parallel import Group
+from tapip3d_lite.training.replay import Replay
 from tapip3d_lite.training.scores import Accuracy, validate
 from tapip3d_lite.training.start import begin_with
 
@@ -40,7 +40,10 @@ class Trainer:
         tracker: what is trained.
         examples: what it is trained on, by step.
         step: steps done, of both stages together.
+        recorded: on a GPU, record steps as CUDA graphs.
     """
+
+    recorded: bool = True
 
     def __init__(
         self,
@@ -84,7 +87,7 @@ class Trainer:
             size = config.tracker_config().image_size
             cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, size)
             cache.check_room(clips)
-        self.examples, self._coming = Examples(config, clips, self.group.rank, cache), None
+        self.examples = Examples(config, clips, self.group.rank, cache)
         saved = self.journal.checkpoint(device)
         if saved is not None:
             self.tracker.load_state_dict(saved["model"])
@@ -192,26 +195,30 @@ class Trainer:
         return {"loss": float(loss.detach()), "right": float(right)}
 
     def _track(self, batch: Batch) -> dict:
-        batch, accuracy, iterations = batch.to(self.device), Accuracy(), self.examples.lengths(self.step)[1]
+        batch, iterations = batch.to(self.device), self.examples.lengths(self.step)[1]
         self._drawn = {"names": batch.names, "queries": batch.queries, "truth": vars(batch.truth)}
+        run = self._add_gradients if self._replay is None else self._replay
+        parts, seen = run(batch, iterations)
+        return losses(parts) | Accuracy.result(seen)
+
+    def _add_gradients(self, batch: Batch, iterations: int) -> tuple[Tensor, Tensor]:
+        accuracy = Accuracy(batch.queries.device)
         options = {"iterations": iterations, "depth_roi": batch.roi, "features": batch.features}
-        with self._precision():
-            totals = saving_backward(
-                self.tracker,
-                batch.frames,
-                batch.queries,
-                batch.truth,
-                self.config.loss,
-                watch=lambda step: accuracy.add(step, batch, iterations),
-                **options,
-            )
-        return totals | accuracy.result()
+        options |= {"watch": lambda step: accuracy.add(step, batch, iterations)}
+        self.tracker.steady = self._replay is not None
+        try:
+            with self._precision():
+                example = batch.frames, batch.queries, batch.truth
+                return add_gradients(self.tracker, *example, self.config.loss, **options), accuracy.totals
+        finally:
+            self.tracker.steady = False
 
     def _precision(self) -> torch.autocast:
         return torch.autocast(self.device, torch.bfloat16, enabled=self.config.precision == "bfloat16")
 
     def _enter_stage(self, saved: dict | None) -> None:
         """Choose what is trained, and make its optimiser."""
+        self._coming = None
         config, encoder = self.config, self.tracker.encoder
         self.tracker.requires_grad_(not self.matching)
         encoder.requires_grad_(self.matching or config.train_encoder)
@@ -219,6 +226,8 @@ class Trainer:
         self.group.share(self.parameters)
         recipe = config.matching if self.matching else config
         self._clip_norm = recipe.clip_norm
+        record = self.recorded and self.device != "cpu"
+        self._replay = Replay(self._add_gradients, self.parameters) if record else None
         plain = [p for p in self.parameters if p.ndim < 2]  # biases and norms are not decayed
         decayed = [p for p in self.parameters if p.ndim >= 2]
         groups = [{"params": decayed, "weight_decay": recipe.weight_decay}, {"params": plain, "weight_decay": 0.0}]
@@ -247,7 +256,5 @@ def _compile(tracker: Tracker) -> None:
     functorch.donated_buffer = False  # the queries' neighbourhoods are walked backward once for each window
     parts = [tracker.encoder, tracker.neighborhood, tracker.context]
     parts += [part for part in tracker.updater.modules() if isinstance(part, Block)]  # alike, so compiled once for all
-    if isinstance(tracker.context, N2N | P2N):
-        parts.append(tracker.context.embed.norm)  # of whole feature maps, by `prepare`
     for part in parts:
         part.compile(dynamic=False)

@@ -1,0 +1,66 @@
+"""`Replay`: a training step recorded once as a CUDA graph, then replayed for each batch.
+
+A step of a small tracker is tens of thousands of small kernels, and Python takes longer to ask for each than a GPU to
+run it. A graph holds them all and is started by one call. The numbers are those of the step itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from tapip3d_lite.training.data import Batch
+
+_WARM = 2  # runs before recording: they compile, and choose algorithms
+
+
+class Replay:
+    """A step that adds gradients, recorded for each number of frames and updates that it meets."""
+
+    def __init__(self, run: Callable[[Batch, int], tuple[Tensor, ...]], parameters: Sequence[nn.Parameter]) -> None:
+        """Prepare to record.
+
+        Args:
+            run: from a batch and M to tensors; leaves gradients. It must ask for no number (`Tracker.steady`).
+            parameters: that get gradients.
+        """
+        self._run, self._parameters, self._recorded = run, list(parameters), {}
+
+    def __call__(self, batch: Batch, iterations: int) -> tuple[Tensor, ...]:
+        """What `run` returns, overwritten by the next call; gradients are set, not added."""
+        key = len(batch.frames), iterations
+        if key not in self._recorded:
+            self._recorded[key] = self._record(batch, iterations)
+        graph, inputs, results, gradients = self._recorded[key]
+        for old, new in zip(_tensors(inputs), _tensors(batch), strict=True):
+            old.copy_(new)
+        graph.replay()
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            parameter.grad = gradient
+        return results
+
+    def _record(self, batch: Batch, iterations: int) -> tuple:
+        inputs, side, graph = batch.map(torch.clone), torch.cuda.Stream(), torch.cuda.CUDAGraph()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(_WARM):
+                self._forget()
+                self._run(inputs, iterations)
+        torch.cuda.current_stream().wait_stream(side)
+        self._forget()  # gradients made while recording belong to the graph
+        with torch.cuda.graph(graph):
+            results = self._run(inputs, iterations)
+        gradients = [parameter.grad for parameter in self._parameters]
+        return graph, inputs, results, gradients
+
+    def _forget(self) -> None:
+        for parameter in self._parameters:
+            parameter.grad = None
+
+
+def _tensors(batch: Batch) -> list[Tensor]:
+    tensors: list[Tensor] = []
+    batch.map(lambda x: tensors.append(x) or x)
+    return tensors

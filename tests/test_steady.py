@@ -1,0 +1,129 @@
+"""A step that asks the device for no number: the same gradients, and nothing that a CUDA graph could not hold."""
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from tapip3d_lite.model.fourier import DEGREES
+from tapip3d_lite.model.support import _at_once
+from tapip3d_lite.training.replay import Replay
+from tapip3d_lite.training.sampling import SamplingConfig
+from tapip3d_lite.training.trainer import Trainer
+from tests.test_trainer import SIZES, clips, recipe
+
+__all__ = ["clips"]
+
+ASKS = ("_local_scalar_dense", "nonzero", "lift_fresh", "unique", "masked_select", "is_nonzero")
+
+
+class Asked(TorchDispatchMode):
+    """Operations that make a CPU wait for a GPU, or copy constants to it."""
+
+    def __enter__(self):
+        self.names = []
+        return super().__enter__()
+
+    def __torch_dispatch__(self, function, types, arguments=(), options=None):
+        name = str(function)
+        self.names += [name for ask in ASKS if ask in name]
+        if name.startswith("aten.index"):
+            tensors = [x for part in arguments if isinstance(part, list | tuple) for x in part]
+            self.names += [name for x in tensors if isinstance(x, torch.Tensor) and x.dtype == torch.bool]
+        return function(*arguments, **(options or {}))
+
+
+@pytest.fixture
+def trainer(tmp_path, clips, monkeypatch):
+    monkeypatch.setattr(
+        "tapip3d_lite.model.tracker.query_support",  # as on a GPU
+        lambda near, scene, times, coords: [_at_once(near, level, scene, times, coords) for level in scene.levels],
+    )
+    # The order of sums differs with masked tracks, and 2^13 x would make much of the last bit.
+    monkeypatch.setattr("tapip3d_lite.model.fourier._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
+    # Some tracks are asked for so late that they do not belong to the first window.
+    late = {"sampling": SamplingConfig(tracks=6, anywhere=1.0, seen=0.0), "frames": (8, 8), "batch": 2}
+    config = recipe(matching_steps=0, train_encoder=True, tracker=SIZES | {"image_size": (32, 32)}, **late)
+    trainer = Trainer(tmp_path, config, clips)
+    trainer.tracker.neighborhood.fast = False  # trees are for a CPU
+    return trainer
+
+
+def gradients(trainer, batch):
+    trainer.optimizer.zero_grad()
+    told = trainer._track(batch)
+    return told, [p.grad.clone() for p in trainer.parameters if p.grad is not None]
+
+
+def alike(some, others):
+    """The biases before an instance norm have no gradient but rounding, of 1e-9."""
+    return all(float((a - b).norm()) < 1e-4 * float(a.norm()) + 2e-8 for a, b in zip(some, others, strict=True))
+
+
+def test_a_steady_step_has_the_same_gradients(trainer):
+    batch = trainer.example()
+    assert int(batch.truth.times.max()) >= 4  # so that some tracks join later
+    told, plain = gradients(trainer, batch)
+    trainer._replay = trainer._add_gradients
+    told_steady, steady = gradients(trainer, batch)
+    assert told_steady == pytest.approx(told, rel=1e-5) and not trainer.tracker.steady
+    assert alike(plain, steady)
+
+
+def test_a_steady_step_asks_for_nothing(trainer):
+    batch = trainer.example().to("cpu")
+    trainer._add_gradients(batch, 2)  # constants are made
+    with Asked() as asked:
+        trainer._add_gradients(batch, 2)
+    assert {"aten._local_scalar_dense.default", "aten.nonzero.default"} <= set(asked.names)  # an ordinary one does
+    trainer._replay = trainer._add_gradients
+    with Asked() as asked:
+        trainer._add_gradients(batch, 2)
+    assert not asked.names
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_recorded_steps_are_the_steps_themselves(tmp_path, clips):
+    logs = []
+    for recorded in (False, True):
+        config = recipe(matching_steps=0, train_encoder=True, iterations=(1, 2), frames=(6, 8))
+        trainer = Trainer(tmp_path / f"{recorded}", config, clips, device="cuda")
+        trainer.recorded = recorded
+        trainer._enter_stage(None)
+        logs.append([line["loss"] for line in trainer.steps()])
+    assert logs[1] == pytest.approx(logs[0], rel=1e-2)
+
+
+def test_a_recording_is_made_for_each_length_and_gets_each_batch(trainer, monkeypatch):
+    """With graphs that run the step again in place of a GPU's: inputs, results and gradients go the right ways."""
+    made = []
+
+    def record(self, batch, iterations):
+        inputs = batch.map(torch.clone)
+        results = self._run(inputs, iterations)
+        gradients = [p.grad for p in self._parameters]
+        made.append((len(batch.frames), iterations))
+
+        class Graph:
+            def replay(_):
+                for p in trainer.parameters:
+                    p.grad = None
+                for old, new in zip(results, self._run(inputs, iterations), strict=True):
+                    old.copy_(new)
+                for old, p in zip(gradients, trainer.parameters, strict=True):
+                    if old is not None:
+                        old.copy_(p.grad)
+
+        return Graph(), inputs, results, gradients
+
+    batches = [trainer.examples.batch(step) for step in range(3)]
+    expected = [gradients(trainer, batch) for batch in batches]
+    monkeypatch.setattr(Replay, "_record", record)
+    trainer._replay = Replay(trainer._add_gradients, trainer.parameters)
+    for batch, (told, plain) in zip(batches, expected, strict=True):
+        again, replayed = gradients(trainer, batch)
+        assert again == pytest.approx(told, rel=1e-5)
+        assert alike(plain, replayed)
+    assert len(made) == len(set(made)) == 1
+    trainer.step = next(s for s in range(50) if trainer.examples.lengths(s)[1] != made[0][1])
+    gradients(trainer, batches[0])
+    assert len(made) == len(set(made)) == 2
