@@ -85,6 +85,8 @@ def test_the_command_makes_the_recipe_again(folder, preset):
     line = next(line for line in text.splitlines() if " train " in line)
     options = shlex.split(line.split("--out runs/lite", 1)[1])
     assert tyro.cli(TrainConfig, args=options, default=TrainConfig.recipe(preset)) == config
+    assert ("augmented (erase, jitter, blur, depth_blur, reframe, flip_x, flip_y)" in text) == (preset == "lite")
+    assert ("images not augmented" in text) == (preset == "paper")
     assert ("--augment" in options, "--no-augment" in options) == (preset == "lite", preset == "paper")
 
 

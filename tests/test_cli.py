@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import tapip3d_lite as t3d
 
@@ -87,6 +88,13 @@ def test_bad_input_is_one_line_and_exit_code_2(clip_file, tmp_path, arguments, m
     result = call(*(names.get(a, a) for a in arguments), cwd=tmp_path)
     assert result.returncode == 2
     assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_told_before_clips_are_simulated(tmp_path):
+    result = call("train", "--out", tmp_path / "run", "--device", "cuda")
+    assert result.returncode == 2 and "no CUDA device; leave --device out" in result.stderr
+    assert not (tmp_path / "run").exists()
 
 
 def test_usage_errors_also_exit_with_2():

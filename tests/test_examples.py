@@ -76,6 +76,11 @@ def test_workers_change_no_bit_of_a_training(tmp_path, clips, one_thread, train_
     assert alone.keys() == helped.keys() and all(torch.equal(alone[name], helped[name]) for name in alone)
 
 
+def test_a_negative_number_of_workers_is_refused(tmp_path, clips):
+    with pytest.raises(ValueError, match="workers must not be negative, got -1"):
+        Trainer(tmp_path, recipe(), clips, workers=-1)
+
+
 def test_workers_leave_the_callers_chance_alone(tmp_path, clips):
     before = torch.get_rng_state()
     Trainer(tmp_path, recipe(train_encoder=True, matching_steps=0, steps=1), clips, workers=1).run(progress=False)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, difference_table, load_results, summary_table
 from tapip3d_lite.model.weights import load_weights
+from tapip3d_lite.training.augment import augmentations
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.journal import read_log
 
@@ -99,7 +100,7 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -
         f"{model.config.window}, K = {model.config.neighbors}, {model.config.levels} levels from stride {model.config.stride}"
         + (f"; set by hand: {', '.join(f'{k}={v}' for k, v in config.tracker.items())}" if config.tracker else ""),
         "data": f"{config.clips} simulated clips; examples of {_range(config.frames)} frames and {config.sampling.tracks} "
-        f"tracks; {'augmented' if config.augment else 'images not augmented'}",
+        f"tracks; images {_changes(config)}",
         "steps": f"{min(log[-1]['step'], config.matching_steps)} of matching, "
         f"{max(log[-1]['step'] - config.matching_steps, 0)} of tracking, batches of {config.batch} in each process"
         + (f"; stopped at step {log[-1]['step']} of {config.total}" if log[-1]["step"] < config.total else ""),
@@ -118,6 +119,11 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -
             f"at step {last['step']} (unscaled, world, {config.validation} clips)"
         )
     return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+
+
+def _changes(config: TrainConfig) -> str:
+    made = [name for name, (share, _) in augmentations(config.augmentation).items() if share > 0]
+    return f"augmented ({', '.join(made)})" if config.augment else "not augmented"
 
 
 def _range(pair: tuple[int, int]) -> str:

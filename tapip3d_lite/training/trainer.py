@@ -71,6 +71,8 @@ class Trainer:
         Raises:
             ValueError: no clips; the folder holds a training already (without `resume`) or one of another recipe; no room.
         """
+        if workers < 0:
+            raise ValueError(f"Trainer: workers must not be negative, got {workers}; 0 makes examples in this process")
         if not clips:
             raise ValueError("Trainer: no training clips; make some with `training_clips` or `simulate`")
         self.config, self.validation, self.device, self.workers = config, list(validation), device, workers
