@@ -42,6 +42,15 @@ def test_parts_add_up_to_the_step(clips, train_encoder):
     assert "100%" in split_table(seconds | {"whole step": whole})
 
 
+def test_the_first_steps_of_the_recipe_are_measured(clips, monkeypatch):
+    from tapip3d_lite.training.examples import Examples
+
+    drawn, lengths = [], Examples.lengths
+    monkeypatch.setattr(Examples, "lengths", lambda self, step: drawn.append(lengths(self, step)) or drawn[-1])
+    step_split(recipe(short=0.1, steps=60), clips, steps=5, warm=1)
+    assert set(drawn) == {(4, 2)}
+
+
 def test_time_is_put_where_it_was_spent(clips, monkeypatch):
     from tapip3d_lite.training.trainer import Trainer
 

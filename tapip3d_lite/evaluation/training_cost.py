@@ -118,7 +118,8 @@ def step_split(config: TrainConfig, clips: Sequence[Path], steps: int = 10, warm
         Seconds of `data`, `k-NN`, `context`, `updater`, `windows' support`, `backward`, `optimiser`, of `loss and the rest`
         (the first frames' neighbours are k-NN's), and of the `whole step`; with a trained encoder also of its forward pass.
     """
-    config = replace(config, matching_steps=0, steps=steps + warm, validation=0, save_every=10**9)
+    count = max(config.steps, steps + warm)  # of fewer, fewer would be short
+    config = replace(config, matching_steps=0, steps=count, validation=0, save_every=10**9)
     rows: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(folder, config, clips)
