@@ -97,6 +97,12 @@ def test_a_gpu_that_is_not_there_is_told_before_clips_are_simulated(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_compiling_is_for_a_gpu(tmp_path):
+    result = call("train", "--out", tmp_path / "run", "--compiled")
+    assert result.returncode == 2 and "add --device cuda, or leave --compiled out" in result.stderr
+    assert not (tmp_path / "run").exists()
+
+
 def test_usage_errors_also_exit_with_2():
     assert call("fly").returncode == 2
     assert call("track").returncode == 2

@@ -44,7 +44,7 @@ def train(
         Whether it is finished, and what to tell the user.
 
     Raises:
-        ValueError: see `Trainer`.
+        ValueError: see `Trainer`; also for a GPU that is not there, or compiling without one.
     """
     recipe = Path(out) / "config.json"
     if resume and recipe.exists():
@@ -52,6 +52,8 @@ def train(
     data = Path(out) / "clips" if data is None else Path(data)
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("train: torch sees no CUDA device; leave --device out to train on the CPU")
+    if compiled and device != "cuda":
+        raise ValueError("train: only a GPU gains from compiling; add --device cuda, or leave --compiled out")
     if workers is None:
         workers = (
             0 if device == "cpu" else max(1, (os.cpu_count() or 2) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)) - 2)

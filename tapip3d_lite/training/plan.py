@@ -54,7 +54,7 @@ def fit_to_time(
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(folder, trial, list(clips)[:2], device=device)
         trainer.run(watch=lines.append, progress=False)
-        encoding = 0.0 if config.train_encoder or device != "cpu" else _encoding(trainer, Path(folder) / "again")
+        encoding = 0.0 if config.train_encoder or device == "cuda" else _encoding(trainer, Path(folder) / "again")
     costs = np.diff([0.0] + [line["seconds"] for line in lines])
     cost = {
         stage: float(np.mean([c for c, line in zip(costs, lines, strict=True) if line["stage"] == stage][_WARM:]))

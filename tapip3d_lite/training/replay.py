@@ -17,7 +17,10 @@ _WARM = 2  # runs before recording: they compile, and choose algorithms
 
 
 class Replay:
-    """A step that adds gradients, recorded for each number of frames and updates that it meets."""
+    """A step that adds gradients, recorded for each number of frames and updates that it meets.
+
+    Each recording keeps a step's memory for itself, so a recipe of many lengths needs as many times as much.
+    """
 
     def __init__(self, run: Callable[[Batch, int], tuple[Tensor, ...]], parameters: Sequence[nn.Parameter]) -> None:
         """Prepare to record.

@@ -84,8 +84,8 @@ class Trainer:
         if config.init is not None:
             begin_with(self.tracker, config.init)
         self.group, self.step, self.seconds = Group(), 0, 0.0
-        cache = None
-        if not config.train_encoder and device == "cpu":
+        self._on_gpu, cache = torch.device(device).type == "cuda", None
+        if not config.train_encoder and not self._on_gpu:
             size = config.tracker_config().image_size
             cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, size)
             cache.check_room(clips)
@@ -228,13 +228,13 @@ class Trainer:
         self.group.share(self.parameters)
         recipe = config.matching if self.matching else config
         self._clip_norm = recipe.clip_norm
-        record = self.recorded and self.device != "cpu"
+        record = self.recorded and self._on_gpu
         self._replay = Replay(self._add_gradients, self.parameters) if record else None
         plain = [p for p in self.parameters if p.ndim < 2]  # biases and norms are not decayed
         decayed = [p for p in self.parameters if p.ndim >= 2]
         groups = [{"params": decayed, "weight_decay": recipe.weight_decay}, {"params": plain, "weight_decay": 0.0}]
         steps = config.matching_steps if self.matching else config.steps
-        self.optimizer = torch.optim.AdamW(groups, recipe.lr, fused=self.device != "cpu" or None)
+        self.optimizer = torch.optim.AdamW(groups, recipe.lr, fused=self._on_gpu or None)
         self.schedule = torch.optim.lr_scheduler.OneCycleLR(
             self.optimizer, recipe.lr, total_steps=steps + 1, pct_start=config.warmup
         )
