@@ -3,6 +3,7 @@
 import json
 import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.benchmark import SPLITS, difference_table, estimate, save_results, show
 from tapip3d_lite.training.card import model_card
 from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.journal import read_log
 from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.motion import MotionConfig
 from tests.test_trainer import SIZES, recipe
@@ -99,3 +101,11 @@ def test_an_unfinished_training_has_no_card(folder):
         model_card(folder, folder / "bench.json", "x")
     with pytest.raises(ValueError, match="card"):
         model_card(folder / "absent", folder / "bench.json", "x")
+
+
+def test_the_shipped_log_is_that_of_the_shipped_card():
+    folder = Path(t3d.__file__).parent / "weights"
+    last = read_log(folder / "lite.jsonl")[-1]
+    scores = "AJ3D {val_AJ3D_none:.3f}, APD3D {val_APD3D_none:.3f}, OA {val_OA:.3f} at step {step}".format(**last)
+    text = (folder / "lite.md").read_text()
+    assert scores in text and f"{last['seconds'] / 3600:.2f} h of steps" in text
