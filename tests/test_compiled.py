@@ -46,16 +46,12 @@ def graphs(monkeypatch):
     counters.clear()
 
 
-def as_on_a_gpu(neighborhood, scene, times, coords):
-    return [_at_once(neighborhood, level, scene, times, coords) for level in scene.levels]
-
-
 # Dynamo looks at the gradient of every tensor that it is given.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf Tensor:UserWarning")
 def test_compiled_parts_take_the_same_steps(tmp_path, clips, graphs, monkeypatch):
     # Compiled, images are resized with other rounding (1e-6), which 2^13 x would make 1e-2 by the second update.
     monkeypatch.setattr("tapip3d_lite.model.fourier._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
-    monkeypatch.setattr("tapip3d_lite.model.tracker.query_support", as_on_a_gpu)
+    monkeypatch.setattr("tapip3d_lite.model.tracker.query_support", _at_once)  # as on a GPU
     sampling = SamplingConfig(tracks=6, seen=1.0, anywhere=0.0)  # all are asked for in the first frame
     sizes = {"frames": 6, "sampling": sampling, "tracker": SIZES | {"time_depth": 2, "space_depth": 2}}  # two windows
     config = recipe(train_encoder=True, matching_steps=0, steps=2, evaluate_every=2, **sizes)

@@ -9,7 +9,7 @@ from tapip3d_lite.model.support import _at_once
 from tapip3d_lite.training.replay import Replay
 from tapip3d_lite.training.sampling import SamplingConfig
 from tapip3d_lite.training.trainer import Trainer
-from tests.test_trainer import SIZES, clips, recipe
+from tests.test_trainer import clips, recipe
 
 __all__ = ["clips"]
 
@@ -34,15 +34,12 @@ class Asked(TorchDispatchMode):
 
 @pytest.fixture
 def trainer(tmp_path, clips, monkeypatch):
-    monkeypatch.setattr(
-        "tapip3d_lite.model.tracker.query_support",  # as on a GPU
-        lambda near, scene, times, coords: [_at_once(near, level, scene, times, coords) for level in scene.levels],
-    )
+    monkeypatch.setattr("tapip3d_lite.model.tracker.query_support", _at_once)  # as on a GPU
     # The order of sums differs with masked tracks, and 2^13 x would make much of the last bit.
     monkeypatch.setattr("tapip3d_lite.model.fourier._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
     # Some tracks are asked for so late that they do not belong to the first window.
     late = {"sampling": SamplingConfig(tracks=6, anywhere=1.0, seen=0.0), "frames": (8, 8), "batch": 2}
-    config = recipe(matching_steps=0, train_encoder=True, tracker=SIZES | {"image_size": (32, 32)}, **late)
+    config = recipe(matching_steps=0, train_encoder=True, **late)
     trainer = Trainer(tmp_path, config, clips)
     trainer.tracker.neighborhood.fast = False  # trees are for a CPU
     return trainer

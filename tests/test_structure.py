@@ -14,7 +14,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 # A module may import from its own floor's folder and from floors below, never above.
 FLOORS = [
-    {"files", "geometry", "validate", "evaluation.metrics"},
+    {"files", "geometry", "processes", "validate", "evaluation.metrics"},
     {"clip", "queries"},
     {"check", "consistency", "simulate", "degrade", "formats", "model"},
     {"training", "evaluation"},

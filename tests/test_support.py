@@ -35,8 +35,8 @@ def test_all_frames_at_once_give_what_one_after_another_gives(switches):
     coords = space.from_world(queries[..., None, 1:], *cameras)[:, :, 0]
     expected = query_support(tracker.neighborhood, scene, times, coords)
     assert len(expected) == 2 and len(times.unique()) == 6 and not torch.equal(times[0], times[1])
-    for level, one in zip(scene.levels, expected, strict=True):
-        other = _at_once(tracker.neighborhood, level, scene, times, coords)
+    others = _at_once(tracker.neighborhood, scene, times, coords)
+    for one, other in zip(expected, others, strict=True):
         assert one.features.shape[:3] == (2, 10, 1 + tracker.config.neighbors)
         for name in ("features", "points", "center", "indices"):
             assert torch.equal(getattr(one, name), getattr(other, name)), name

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 import os
-import signal
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
@@ -19,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tapip3d_lite.clip import Clip, load_clip
+from tapip3d_lite.processes import leave_interrupts
 from tapip3d_lite.simulate import Recording, SimulationConfig, record, render_clip
 from tapip3d_lite.simulate.recording import load_recordings, save_recordings
 from tapip3d_lite.simulate.seeds import BENCHMARK
@@ -160,7 +160,7 @@ def _film(jobs: list[Job], workers: int, progress: bool) -> Iterator[str]:
     """Film clips into the cache and tell the name of each when it is there."""
     with tqdm(total=len(jobs), desc="filming", unit="clip", disable=not (progress and jobs)) as bar:
         if min(workers, len(jobs)) > 1:
-            with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs)), _leave_interrupts) as pool:
+            with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs)), leave_interrupts) as pool:
                 for name in pool.imap_unordered(_film_one, jobs):
                     bar.update()
                     yield name
@@ -168,10 +168,6 @@ def _film(jobs: list[Job], workers: int, progress: bool) -> Iterator[str]:
             for job in jobs:
                 yield _film_one(job)
                 bar.update()
-
-
-def _leave_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
 
 
 def _film_one(job: Job) -> str:

@@ -56,19 +56,17 @@ class Ready:
     mixed: Tensor | None = None
 
     def __getitem__(self, index: tuple) -> Ready:
-        names = [f.name for f in fields(self) if f.name not in ("pair", "offsets", "pools", "mixed")]
-        parts = {name: getattr(self, name) for name in names}
-        return replace(self, **{name: part[index] for name, part in parts.items() if part is not None})
+        return self._changed(lambda part: part[index], "mixed")
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Ready:
         """The same with other tensors."""
         pools = tuple(FoldedPool(*(change(getattr(pool, f.name)) for f in fields(pool))) for pool in self.pools)
-        names = [
-            f.name
-            for f in fields(self)
-            if f.name not in ("pair", "offsets", "pools") and getattr(self, f.name) is not None
-        ]
-        return replace(self, pools=pools, **{name: change(getattr(self, name)) for name in names})
+        return replace(self._changed(change), pools=pools)
+
+    def _changed(self, change: Callable[[Tensor], Tensor], *kept: str) -> Ready:
+        names = [f.name for f in fields(self) if f.name not in ("pair", "offsets", "pools", *kept)]
+        parts = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: change(part) for name, part in parts.items() if part is not None})
 
     def compare(self, near: Neighbors) -> Tensor:
         """As `N2N.forward`: neighbourhoods (B, S, N, K, ...) to (B, S, N, width)."""

@@ -15,12 +15,11 @@ from torch import Tensor, nn
 
 from tapip3d_lite.model.cloud import Level, Normalizer
 from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.organized import BlockTree
+from tapip3d_lite.model.organized import INFINITE, BlockTree
 
 _BUDGET = 2**24  # distances that exist at once: 64 MiB in float32; on a GPU 16 times as many
 _FEW = 2**16  # distances that are computed sooner than a tree is searched
 _RUN = 8  # neighbouring cells that are looked at together
-_INFINITE = int(torch.tensor(torch.inf).view(torch.int32))  # its bits
 
 
 @dataclass(frozen=True)
@@ -149,7 +148,7 @@ def _smallest(distance: Tensor, indices: Tensor, count: int) -> tuple[Tensor, Te
     # The bits of a non-negative float order like the float itself, so one integer holds (distance, index).
     key = (distance.view(torch.int32).long() << 32) + indices
     near = key.topk(count, dim=-1, largest=False).values
-    return near & 0xFFFFFFFF, (near >> 32) == _INFINITE
+    return near & 0xFFFFFFFF, (near >> 32) == INFINITE
 
 
 def squared_distances(queries: Tensor, points: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ _LARGE = 128 * BLOCK[0] * BLOCK[1]  # cells of a map from which on its blocks ar
 _SHORT = 256  # numbers in a row up to which sorting all is quicker than finding the smallest
 _BUDGET = 2**18  # distances at once: a MiB, so that temporaries stay in the cache
 _WIDER = (1, 2, 6)  # times as many boxes are opened for points whose proof failed; then all
-_INFINITE = int(torch.tensor(torch.inf).view(torch.int32))  # bits of non-negative floats order like the floats
+INFINITE = int(torch.tensor(torch.inf).view(torch.int32))  # bits of non-negative floats order like the floats
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class BlockTree:
 
     def _nearest(self, queries: Tensor, frames: Tensor, count: int, opened: list[int]) -> tuple[Tensor, Tensor]:
         """The K nearest (R, K) of the cells in as many boxes of each level as may be opened; whether it is proven."""
-        parents, limit = frames[:, None], torch.full((len(queries),), _INFINITE, dtype=torch.int32)
+        parents, limit = frames[:, None], torch.full((len(queries),), INFINITE, dtype=torch.int32)
         for boxes, number in zip(self.levels[:-1], opened, strict=True):
             bound, size = boxes.squared_distances(queries, parents), boxes.low.shape[-1]
             first = parents * size
@@ -137,7 +137,7 @@ class BlockTree:
         key = _sorted(key.view(torch.int64).squeeze(-1), count).view(torch.int32).view(len(queries), count, 2)
         index, bits = key.unbind(-1)
         if self.masked:  # the nearest fills the slots of cells that may not be chosen
-            index = torch.where(bits < _INFINITE, index, torch.where(bits[:, :1] < _INFINITE, index[:, :1], 0))
+            index = torch.where(bits < INFINITE, index, torch.where(bits[:, :1] < INFINITE, index[:, :1], 0))
         return index.long(), bits[:, -1] < limit
 
 

@@ -30,7 +30,7 @@ def query_support(
         For each level (B, N, 1 + K, ...): row 0 is the query, with the bilinear feature at its pixel and index -1.
     """
     if coords.is_cuda:
-        return [_at_once(neighborhood, level, scene, times, coords) for level in scene.levels]
+        return _at_once(neighborhood, scene, times, coords)
     groups = []  # (frame, columns queried there in any batch element, their cells' pixels)
     for frame in times.unique().tolist():
         columns = (times == frame).any(0).nonzero()[:, 0]
@@ -40,17 +40,29 @@ def query_support(
     return [_level_support(neighborhood, level, scene.frames.size, groups, times, coords) for level in scene.levels]
 
 
-def _at_once(
-    neighborhood: Callable[..., Neighbors], level: Level, scene: Scene, times: Tensor, coords: Tensor
-) -> Neighbors:
+def _at_once(neighborhood: Callable[..., Neighbors], scene: Scene, times: Tensor, coords: Tensor) -> list[Neighbors]:
     """All queries in all frames, of which each query's own is kept: T times the work, T times fewer calls for a GPU."""
     frames, (batch, count) = scene.frames, times.shape
     everywhere = coords[:, None].expand(-1, len(frames), -1, -1)
-    cells = level.cells(scene.space.to_pixels(everywhere, frames.intrinsics, frames.extrinsics), frames.size)
-    near = neighborhood(level, everywhere, cells)
-    own = bilinear(level.features.flatten(0, 1), cells.flatten(0, 1)).unflatten(0, (batch, -1))[:, :, :, None]
-    center = near.center.unsqueeze(-2)
+    uv = scene.space.to_pixels(everywhere, frames.intrinsics, frames.extrinsics)
     row = torch.arange(batch, device=coords.device)[:, None], times, torch.arange(count, device=coords.device)
+    return [
+        _level_at_once(neighborhood, level, everywhere, level.cells(uv, frames.size), row, coords)
+        for level in scene.levels
+    ]
+
+
+def _level_at_once(
+    neighborhood: Callable[..., Neighbors],
+    level: Level,
+    everywhere: Tensor,
+    cells: Tensor,
+    row: tuple[Tensor, Tensor, Tensor],
+    coords: Tensor,
+) -> Neighbors:
+    near = neighborhood(level, everywhere, cells)
+    own = bilinear(level.features.flatten(0, 1), cells.flatten(0, 1)).unflatten(0, (len(coords), -1))[:, :, :, None]
+    center = near.center.unsqueeze(-2)
     features, points = torch.cat([own, near.features], 3)[row], torch.cat([center, near.points], 3)[row]
     if near.indices is None:
         return Neighbors(features, points, coords, None)

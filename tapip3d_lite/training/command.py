@@ -55,9 +55,8 @@ def train(
     if compiled and device != "cuda":
         raise ValueError("train: only a GPU gains from compiling; add --device cuda, or leave --compiled out")
     if workers is None:
-        workers = (
-            0 if device == "cpu" else max(1, (os.cpu_count() or 2) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)) - 2)
-        )
+        cores = (os.cpu_count() or 2) // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
+        workers = 0 if device == "cpu" else max(1, cores - 2)
     large = config.tracker_config().image_size > (128, 128)
     with _processes(device) as leads:
         progress = progress and leads

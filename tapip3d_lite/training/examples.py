@@ -6,7 +6,6 @@ gone, and it does not matter which process makes an example, or when.
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.processes import leave_interrupts
 from tapip3d_lite.training.augment import augment
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.data import Batch, FeatureCache, make_batch
@@ -101,13 +101,9 @@ class Examples(Dataset):
         steps = range(first, matching if first < matching else len(self))
         if not workers:
             return (self[step] for step in steps)
-        own = {"generator": torch.Generator(), "worker_init_fn": _leave_interrupts}  # the caller's chance is not ours
+        own = {"generator": torch.Generator(), "worker_init_fn": leave_interrupts}  # the caller's chance is not ours
         return iter(DataLoader(self, None, sampler=steps, num_workers=workers, **own))
 
 
 def _share(rank: int, count: int) -> range:
     return range(rank * count, (rank + 1) * count)
-
-
-def _leave_interrupts(worker: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training, which ends its workers

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import project
+from tapip3d_lite.model.constants import constant
 from tapip3d_lite.training.augment import AugmentConfig, augment
 from tapip3d_lite.training.sampling import load_part
 
@@ -149,13 +150,13 @@ def matching_loss(encoder: nn.Module, pairs: Sequence[Pair], config: MatchingCon
 
 def _pair_loss(maps: Tensor, pair: Pair, config: MatchingConfig) -> tuple[Tensor, Tensor]:
     total = right = torch.zeros((), device=pair.uv.device)
-    size = torch.tensor([pair.rgb.shape[3], pair.rgb.shape[2]], device=pair.uv.device)
+    size = constant((float(pair.rgb.shape[3]), float(pair.rgb.shape[2])), pair.uv)
     for level in range(config.levels):
         maps = F.avg_pool2d(maps, 2) if level else maps
         height, width = maps.shape[-2:]
         if min(height, width) < 2:  # a small image has no more levels
             break
-        cells = pair.uv * torch.tensor([width, height], device=pair.uv.device) / size
+        cells = pair.uv * constant((float(width), float(height)), pair.uv) / size
         scores = _similarity(maps, cells[0])
         columns, rows = (torch.arange(n, device=pair.uv.device, dtype=torch.float32) for n in (width, height))
         places = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).flatten(0, 1)  # (h w, 2), row by row
@@ -175,7 +176,7 @@ def _similarity(maps: Tensor, cells: Tensor) -> Tensor:
     """How alike features at cells (N, 2) of the first map are to every cell of the second; maps (2, C, h, w)."""
     height, width = maps.shape[-2:]
     normed = F.layer_norm(maps.movedim(1, -1), maps.shape[1:2])  # as the tracker's tokens are
-    grid = cells / torch.tensor([width - 1, height - 1], device=cells.device) * 2 - 1
+    grid = cells / constant((width - 1.0, height - 1.0), cells) * 2 - 1
     source = normed[:1].movedim(-1, 1)
     own = F.grid_sample(source, grid[None, None], align_corners=True, padding_mode="border")[0, :, 0].T  # (N, C)
     return own @ normed[1].flatten(0, 1).T / maps.shape[1] ** 0.5

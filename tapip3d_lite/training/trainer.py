@@ -86,7 +86,7 @@ class Trainer:
         self.group, self.step, self.seconds = Group(), 0, 0.0
         self._on_gpu, cache = torch.device(device).type == "cuda", None
         if not config.train_encoder and not self._on_gpu:
-            size = config.tracker_config().image_size
+            size = self.tracker.config.image_size
             cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, size)
             cache.check_room(clips)
         self.examples = Examples(config, clips, self.group.rank, cache)
