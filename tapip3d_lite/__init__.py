@@ -25,14 +25,14 @@ _HOMES = {
     "model.weights": ["load_official", "load_weights", "save_weights"],
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-_MODULES = {"geometry": "geometry", "figures": "ui.figures", "exercises": "ui.exercises", "widgets": "ui.widgets"}
+_MODULES = ("geometry", "figures")
 
 __all__ = [*_HOME_OF, *_MODULES]
 
 
 def __getattr__(name: str) -> object:
     if name in _MODULES:
-        return import_module(f"{__name__}.{_MODULES[name]}")
+        return import_module(f"{__name__}.{name}")
     if name in _HOME_OF:
         return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -89,14 +89,14 @@ def benchmark(
 ) -> None:
     """Score trackers on the Lite benchmark; prints Markdown tables with 95 % bootstrap intervals over clips."""
     from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, summary_table
-    from tapip3d_lite.leaderboard import score_trackers
+    from tapip3d_lite.lab.leaderboard import score_trackers
 
     splits = split or SPLITS
     results = score_trackers(tracker, splits, space, count, out, device)
     for part in ("", "_dynamic", "_static"):
         print(summary_table(results, tuple(metric + part for metric in METRICS), splits) + "\n")
     if figure:
-        from tapip3d_lite.ui.scores import score_figure
+        from tapip3d_lite.figures.curves import score_figure
 
         t3d.figures.save_png(score_figure(results, splits=splits), figure)
         print(f"wrote {figure}")
@@ -147,10 +147,10 @@ def train(
     measure: Annotated[bool, arg(help="only print where a step's time goes, and what backward keeps (CPU)")] = False,
 ) -> None:
     """Train a tracker on simulated clips, by default by the recipe of --preset (lite or paper); Ctrl-C saves and stops, --resume goes on exactly there."""
-    from tapip3d_lite.training.command import train as run
+    from tapip3d_lite.lab.train import train as run
 
     if measure:
-        from tapip3d_lite.evaluation.training_cost import report
+        from tests.bench.training_cost import report
 
         return print(report(config, (data or out / "clips") / "train"))
     try:

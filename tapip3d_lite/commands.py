@@ -22,7 +22,7 @@ def card(
 ) -> None:
     """Write the model card of a training folder and of results that `benchmark --out` wrote."""
     from tapip3d_lite.files import atomic_path
-    from tapip3d_lite.training.card import model_card
+    from tapip3d_lite.lab.card import model_card
 
     text = model_card(folder, results, hardware, name, command, weights)
     with atomic_path(out) as temporary:
@@ -38,7 +38,7 @@ def curves(
 ) -> None:
     """Draw the learning curves of trainings, finished or not: matching, loss, accuracy, held-out scores."""
     from tapip3d_lite.training.journal import read_log
-    from tapip3d_lite.ui.training import learning_curves
+    from lessons.n06_live import learning_curves
 
     logs = [(folder.stem if folder.is_file() else folder.resolve().name, read_log(folder)) for folder in folders]
     t3d.figures.save_png(learning_curves(logs, by=by), out)
@@ -47,7 +47,7 @@ def curves(
 
 def samples(out: Path = Path("data_samples")) -> None:
     """Regenerate the sample clips and their table from seeds."""
-    from tapip3d_lite.simulate.samples import write_samples
+    from lessons.samples import write_samples
 
     write_samples(out)
 
@@ -88,7 +88,7 @@ def bench(
 
     import torch
 
-    from tapip3d_lite.evaluation import bench as measure
+    from tests.bench import bench as measure
     from tapip3d_lite.files import atomic_path
 
     if threads is not None:
@@ -100,7 +100,7 @@ def bench(
             temporary.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
         print(f"wrote {out}")
     if figure:
-        from tapip3d_lite.ui.speed import speed
+        from tests.bench.speed_figure import speed
 
         t3d.figures.save_png(speed(rows), figure)
         print(f"wrote {figure}")
@@ -109,7 +109,7 @@ def bench(
 def formulas(out: Path = Path("notebooks/FORMULAS.md")) -> None:
     """Write the table "formula → symbol → tensor → shape → file:line" from the code."""
     from tapip3d_lite.files import atomic_path
-    from tapip3d_lite.ui.formulas import formula_table
+    from lessons.formulas import formula_table
 
     with atomic_path(out) as temporary:
         temporary.write_text(formula_table(), encoding="utf-8")
@@ -122,6 +122,6 @@ def teach(
     lesson: Annotated[int, arg(help="minutes of a lesson")] = 45,
 ) -> None:
     """Write a teacher's pack: student and solution versions of all notebooks, and a timing plan."""
-    from tapip3d_lite.ui.teaching import write_pack
+    from lessons.teaching import write_pack
 
     print(f"wrote {len(write_pack(notebooks, out, lesson))} files to {out}; begin with {out / 'TIMING.md'}")

@@ -2,7 +2,7 @@
 
 import sys
 
-from tapip3d_lite.ui.exercises import EXERCISES, check
+from lessons import EXERCISES, check
 
 
 def rows():

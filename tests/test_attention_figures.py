@@ -7,7 +7,7 @@ from matplotlib.patches import ConnectionPatch
 
 import tapip3d_lite as t3d
 from tapip3d_lite.geometry import project
-from tapip3d_lite.ui.attention import WAYS, Pair, cell_centers, entropy, fourier_waves, rates, two_bags, who_looks_where
+from lessons.n04_figures import Pair, WAYS, cell_centers, entropy, fourier_waves, rates, two_bags, who_looks_where
 
 K = 4
 

@@ -13,9 +13,9 @@ import torch
 from torch import nn
 
 import tapip3d_lite as t3d
-from tapip3d_lite.evaluation import bench
-from tapip3d_lite.evaluation.timing import extra_memory, own_clock, ratios, side_by_side, stages
-from tapip3d_lite.ui.speed import speed
+from tests.bench import bench
+from tests.bench.timing import extra_memory, own_clock, ratios, side_by_side, stages
+from tests.bench.speed_figure import speed
 
 LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory is read from /proc")
 

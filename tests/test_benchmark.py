@@ -15,11 +15,11 @@ from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker
 from tapip3d_lite.evaluation.benchmark import difference_table, load_results, run_benchmark, save_results, summary_table
 from tapip3d_lite.evaluation.intervals import bootstrap_interval, paired_difference
 from tapip3d_lite.evaluation.lite_splits import FOLDER, SPLITS, benchmark_clips, differences, fingerprint
-from tapip3d_lite.leaderboard import score_trackers
+from tapip3d_lite.lab.leaderboard import score_trackers
 from tapip3d_lite.simulate import record, render_clip, seeds, simulate_clip, simulator
 from tapip3d_lite.simulate.recording import load_recordings, save_recordings
-from tapip3d_lite.simulate.samples import SAMPLES, longest_gap
-from tapip3d_lite.ui.scores import score_figure
+from lessons.samples import SAMPLES, longest_gap
+from tapip3d_lite.figures.curves import score_figure
 
 
 def same(a, b):
@@ -304,7 +304,7 @@ def test_finished_clips_are_kept_until_the_tracker_changes(two_clips, tmp_path, 
     first = score_trackers(["static"], **options)
     assert list(score_trackers(["klt"], **options)) == ["klt"]
     assert score_trackers(["static"], **options) == first and len(tracked) == 4
-    monkeypatch.setattr("tapip3d_lite.leaderboard.load_tracker", lambda *_, **__: StaticTracker(slack=0.5))
+    monkeypatch.setattr("tapip3d_lite.lab.leaderboard.load_tracker", lambda *_, **__: StaticTracker(slack=0.5))
     score_trackers(["static"], **options)
     assert len(tracked) == 6
     assert set(load_results(out)[0]) == {"static", "klt"}
@@ -316,7 +316,7 @@ def test_learnt_trackers_run_once_a_space_and_again_with_new_weights(two_clips, 
 
     model, seen = Tracker(TrackerConfig.preset("lite")), []
     monkeypatch.setattr(Tracker, "track", lambda self, clip, space: seen.append(space) or clip.tracks)
-    monkeypatch.setattr("tapip3d_lite.leaderboard.load_tracker", lambda *_, **__: model)
+    monkeypatch.setattr("tapip3d_lite.lab.leaderboard.load_tracker", lambda *_, **__: model)
     options = {
         "splits": ["occlusion"],
         "spaces": ["world", "camera"],

@@ -13,7 +13,7 @@ import time
 
 import pytest
 
-from tapip3d_lite.ui.teaching import read_notebook
+from lessons.teaching import read_notebook
 from tests.notebook_tools import FOLDER, ROOT
 
 BROWSERS = [

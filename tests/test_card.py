@@ -11,7 +11,7 @@ import tyro
 
 import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.benchmark import SPLITS, difference_table, estimate, save_results, show
-from tapip3d_lite.training.card import model_card
+from tapip3d_lite.lab.card import model_card
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.journal import read_log
 from tapip3d_lite.training.loss import LossConfig

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from tapip3d_lite.ui.exercises import EXERCISES
-from tapip3d_lite.ui.exercises.core import Exercise, Mistake, compare, judge
+from lessons import EXERCISES
+from lessons.checker import Exercise, Mistake, compare, judge
 from tests.exercise_matrix import table
 
 MISTAKES = [(name, mistake.name) for name, exercise in EXERCISES.items() for mistake in exercise.mistakes]

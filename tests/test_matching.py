@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from tapip3d_lite.evaluation import matching
-from tapip3d_lite.evaluation.matching import paired_bags, similarity_attention, votes
+from lessons import n04_matching as matching
+from lessons.n04_matching import paired_bags, similarity_attention, votes
 from tapip3d_lite.model.cloud import feature_cloud
 from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.model.parts import make_space

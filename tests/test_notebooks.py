@@ -6,7 +6,7 @@ import re
 import nbformat
 import pytest
 
-from tapip3d_lite.ui.teaching import solution_copy, solution_of, tags
+from lessons.teaching import solution_copy, solution_of, tags
 from tests.notebook_tools import ROOT, clean, notebooks, run
 
 NOTEBOOKS = notebooks()

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tapip3d_lite.evaluation.straightness import SPACES, bend, fit_windows, from_space, stays_in_view, to_space
+from lessons.n02_straightness import SPACES, bend, fit_windows, from_space, stays_in_view, to_space
 from tapip3d_lite.geometry import look_at, project
 
 T, N = 12, 7

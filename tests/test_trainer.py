@@ -47,7 +47,7 @@ RUN = """
 import sys, torch
 from pathlib import Path
 from tests.test_trainer import recipe
-from tapip3d_lite.training.command import interruptible
+from tapip3d_lite.lab.train import interruptible
 from tapip3d_lite.training.trainer import Trainer
 torch.set_num_threads(1)
 trainer = Trainer(sys.argv[1], recipe(), sorted(Path(sys.argv[2]).glob("*.npz")), resume=True)

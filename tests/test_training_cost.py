@@ -5,7 +5,7 @@ import time
 import pytest
 import torch
 
-from tapip3d_lite.evaluation.training_cost import SavedBytes, backward_memory, memory_table, split_table, step_split
+from tests.bench.training_cost import SavedBytes, backward_memory, memory_table, split_table, step_split
 from tests.test_trainer import SIZES, clips, recipe
 
 __all__ = ["clips"]

@@ -17,10 +17,10 @@ from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.plan import fit_to_time
 from tapip3d_lite.training.sampling import SamplingConfig
 from tapip3d_lite.training.trainer import Trainer
-from tapip3d_lite.ui.augmentations import TITLES, before_and_after, motion_paths
-from tapip3d_lite.ui.exercises.chain import Chain, plain, saving
-from tapip3d_lite.ui.motion import MOVING
-from tapip3d_lite.ui.training import LivePlot, learning_curve, learning_curves, tracks_and_truth, train_live
+from lessons.n06_augmentations import TITLES, before_and_after, motion_paths
+from lessons.n06_chain import Chain, plain, saving
+from lessons.n02_figures import MOVING
+from lessons.n06_live import LivePlot, learning_curve, learning_curves, tracks_and_truth, train_live
 
 SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
 SIZES |= {"context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2}
@@ -164,7 +164,7 @@ def test_drawing_takes_a_small_share_of_the_time(trainer, monkeypatch):
         clock[0] += 10.0
         draw(live)
 
-    monkeypatch.setattr("tapip3d_lite.ui.training.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr("lessons.n06_live.time", SimpleNamespace(monotonic=lambda: clock[0]))
     monkeypatch.setattr(LivePlot, "draw", slow)
     step = trainer._one_step
     monkeypatch.setattr(trainer, "_one_step", lambda: (clock.__setitem__(0, clock[0] + 100.0), step())[1])

@@ -8,8 +8,8 @@ import tapip3d_lite as t3d
 from tapip3d_lite.geometry import project
 from tapip3d_lite.model.tokens import token_width
 from tapip3d_lite.model.windows import window_ends
-from tapip3d_lite.ui.exercises.updates import window_starts
-from tapip3d_lite.ui.updates import converging, film, paired, token_bar, token_parts, windows_chart, without
+from lessons.n05_exercises import window_starts
+from lessons.n05_figures import converging, film, paired, token_bar, token_parts, windows_chart, without
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import invert, transform, unproject
-from tapip3d_lite.ui.figures2d import check_drawable, track_colors
+from tapip3d_lite.figures.flat import check_drawable, track_colors
 
 _LEVELS = 12  # colour levels per channel: a code into 1728 colours costs two bytes a point, an RGB string twenty
 

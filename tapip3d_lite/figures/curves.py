@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from tapip3d_lite.evaluation.benchmark import SPLITS, Results, estimate
-from tapip3d_lite.ui.figures2d import INK
+from tapip3d_lite.figures.flat import INK
 
 COLORS = ("#8a8f98", "#e8a33d", "#2b6cb0", "#d1495b", "#2f855a", "#6b46c1")
 NAMES = {

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from tapip3d_lite.geometry import transform
-from tapip3d_lite.ui.exercises.chain import BACKWARD
-from tapip3d_lite.ui.exercises.core import Exercise, Mistake
+from lessons.n06_chain import BACKWARD
+from lessons.checker import Exercise, Mistake
 
 Array = np.ndarray
 

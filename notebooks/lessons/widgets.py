@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import ipywidgets as widgets
 from matplotlib.figure import Figure
 
-from tapip3d_lite.ui.figures import png_bytes
+from tapip3d_lite.figures import png_bytes
 
 Control = tuple[int, int] | tuple[float, float] | Sequence[str]
 

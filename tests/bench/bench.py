@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.evaluation.rows import Row, compared, table
-from tapip3d_lite.evaluation.timing import extra_memory, own_clock, side_by_side, stages
+from tests.bench.rows import Row, compared, table
+from tests.bench.timing import extra_memory, own_clock, side_by_side, stages
 from tapip3d_lite.model.cloud import feature_cloud
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.frames import frames_from_clip, resize_clip

@@ -16,8 +16,8 @@ from tapip3d_lite.geometry import project
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.fourier import FACTOR, fourier
 from tapip3d_lite.model.frames import frames_from_clip
-from tapip3d_lite.ui.exercises.updates import hand_over
-from tapip3d_lite.ui.figures2d import INK, _image, _plot, check_drawable
+from lessons.n05_exercises import hand_over
+from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
 
 ESTIMATE, TRUTH = "#e8a33d", "#2b6cb0"
 PARTS = ("motion", "virtual tracks")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tapip3d_lite.ui.exercises.core import Exercise, Mistake
+from lessons.checker import Exercise, Mistake
 
 
 class Chain:

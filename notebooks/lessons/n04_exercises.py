@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tapip3d_lite.model.fourier import DEGREES
-from tapip3d_lite.ui.exercises.core import Exercise, Mistake
+from lessons.checker import Exercise, Mistake
 
 Array = np.ndarray
 Weights = tuple[Array, Array, Array, Array]  # W_q, W_k, W_v (E, D) and W_o (D, E), used as x @ W.T

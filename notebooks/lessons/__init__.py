@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from tapip3d_lite.ui.exercises.core import Answer, Exercise, Mistake, Verdict, judge, score_guess
+from lessons.checker import Answer, Exercise, Mistake, Verdict, judge, score_guess
 
 _MODULES = ("start", "lifting", "world", "neighborhoods", "attention", "training", "updates")
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tapip3d_lite.geometry import invert, resize_intrinsics, transform, unproject
-from tapip3d_lite.ui.exercises.core import Exercise, Mistake
+from lessons.checker import Exercise, Mistake
 
 Array = np.ndarray
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from tapip3d_lite.evaluation.bench import Row
+from tests.bench.bench import Row
 
 _STAGES = ("encoder", "k-NN", "context", "updater", "the rest")
 _COLOURS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d9d9d")

@@ -16,16 +16,8 @@ from IPython.display import display
 from matplotlib.figure import Figure
 
 from tapip3d_lite.files import atomic_path
-from tapip3d_lite.ui.figures2d import (
-    contact_sheet,
-    depth_map,
-    frame_with_tracks,
-    overview,
-    scores_bar,
-    track_colors,
-    tracks_over_time,
-)
-from tapip3d_lite.ui.figures3d import tracks_3d, tracks_3d_static
+from tapip3d_lite.figures.flat import contact_sheet, depth_map, frame_with_tracks, overview, scores_bar, track_colors, tracks_over_time
+from tapip3d_lite.figures.scene_3d import tracks_3d, tracks_3d_static
 
 __all__ = [
     "contact_sheet",

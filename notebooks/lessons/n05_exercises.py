@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tapip3d_lite.ui.exercises.attention import fourier_features, softmax
-from tapip3d_lite.ui.exercises.core import Exercise, Mistake
+from lessons.n04_exercises import fourier_features, softmax
+from lessons.checker import Exercise, Mistake
 
 Array = np.ndarray
 

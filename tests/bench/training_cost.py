@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tapip3d_lite.evaluation.timing import stages
+from tests.bench.timing import stages
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.model.tracker import Tracker

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tapip3d_lite.geometry import project, unproject
-from tapip3d_lite.ui.exercises.core import Exercise, Mistake
+from lessons.checker import Exercise, Mistake
 
 Array = np.ndarray
 

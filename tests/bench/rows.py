@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tapip3d_lite.evaluation.timing import ratios
+from tests.bench.timing import ratios
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Experiments under equal conditions; what needs both training and evaluation."""
