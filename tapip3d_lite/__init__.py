@@ -19,10 +19,10 @@ _HOMES = {
     "evaluation.evaluate": ["evaluate"],
     "trackers": ["list_trackers", "load_tracker"],
     "model.config": ["TrackerConfig"],
-    "model.official": ["from_official_state"],
-    "model.recorder": ["Recorder"],
     "model.tracker": ["Tracker"],
-    "model.weights": ["load_official", "load_weights", "save_weights"],
+    "model.weights": ["load_weights", "save_weights"],
+    "official": ["from_official_state", "load_official"],
+    "recorder": ["Recorder"],
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 _MODULES = ("geometry", "figures")

@@ -37,8 +37,8 @@ def curves(
     by: Annotated[str, arg(help="step or minutes")] = "step",
 ) -> None:
     """Draw the learning curves of trainings, finished or not: matching, loss, accuracy, held-out scores."""
-    from tapip3d_lite.training.journal import read_log
     from lessons.n06_live import learning_curves
+    from tapip3d_lite.training.journal import read_log
 
     logs = [(folder.stem if folder.is_file() else folder.resolve().name, read_log(folder)) for folder in folders]
     t3d.figures.save_png(learning_curves(logs, by=by), out)
@@ -88,8 +88,8 @@ def bench(
 
     import torch
 
-    from tests.bench import bench as measure
     from tapip3d_lite.files import atomic_path
+    from tests.bench import bench as measure
 
     if threads is not None:
         torch.set_num_threads(threads)
@@ -108,8 +108,8 @@ def bench(
 
 def formulas(out: Path = Path("notebooks/FORMULAS.md")) -> None:
     """Write the table "formula → symbol → tensor → shape → file:line" from the code."""
-    from tapip3d_lite.files import atomic_path
     from lessons.formulas import formula_table
+    from tapip3d_lite.files import atomic_path
 
     with atomic_path(out) as temporary:
         temporary.write_text(formula_table(), encoding="utf-8")

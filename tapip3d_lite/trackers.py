@@ -37,12 +37,13 @@ def list_trackers() -> list[str]:
     return sorted(shipped_weights()) + list(_BASELINES)
 
 
-def load_tracker(name: str | Path = "lite", device: str = "cpu") -> TrackerLike:
+def load_tracker(name: str | Path = "lite", device: str = "cpu", fast: bool = True) -> TrackerLike:
     """A tracker by name, or from a weights file.
 
     Args:
         name: one of `list_trackers()`, or the path of a `.safetensors` file.
         device: where a learnt tracker computes, `"cpu"` or `"cuda"`.
+        fast: compute by the fast forms of a learnt tracker's parts; False: by the clear ones, for the same numbers.
 
     Raises:
         ValueError: neither a known name nor a file.
@@ -56,4 +57,4 @@ def load_tracker(name: str | Path = "lite", device: str = "cpu") -> TrackerLike:
         )
     from tapip3d_lite.model.weights import load_weights
 
-    return load_weights(path, device=device)
+    return load_weights(path, device, fast)

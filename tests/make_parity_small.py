@@ -11,8 +11,8 @@ import json
 import numpy as np
 import torch
 
-from tapip3d_lite.model.official import official_config, parameter_names
 from tapip3d_lite.model.tracker import Tracker
+from tapip3d_lite.official import official_config, parameter_names
 from tests import parity
 
 MODEL = {

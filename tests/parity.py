@@ -14,17 +14,17 @@ import numpy as np
 import torch
 
 from tapip3d_lite.model.cloud import Level, Normalizer, quantile_roi
-from tapip3d_lite.model.contexts import N2N
 from tapip3d_lite.model.frames import Frames
+from tapip3d_lite.model.n2n import N2N
 from tapip3d_lite.model.neighbors import Neighbors
-from tapip3d_lite.model.official import from_official_state
-from tapip3d_lite.model.parts import make_space
-from tapip3d_lite.model.scene import Window
-from tapip3d_lite.model.windows import State
+from tapip3d_lite.model.registry import make_space
+from tapip3d_lite.model.windows import State, Window
+from tapip3d_lite.official import from_official_state
 from tapip3d_lite.queries import grid_queries
 
 GOLDEN = Path(__file__).resolve().parents[2] / "shared" / "golden"
 SMALL = Path(__file__).resolve().parent / "data" / "parity_small.npz"
+FAST = True  # which form of the parts is measured
 STAGED = ("A_raw", "A_local", "A_pad", "A_rough", "B_raw")
 # Noise between valid float32 evaluations of normalised coordinates, after 1, 2, ... updates in a row (times 10).
 _FREE = [1e-5, 6e-5, 3e-4, 2e-3, 7e-3, 4e-2]
@@ -53,7 +53,7 @@ class Golden:
         self.config = json.loads(str(self.arrays["config_json"]))
         state = {key[6:]: self[key] for key in self.arrays.files if key.startswith("param.")}
         if state:
-            self.tracker = from_official_state(self.config, state)
+            self.tracker = from_official_state(self.config, state, FAST)
         self.frames = Frames(*(self[f"in.{key}"][None] for key in ("rgb", "depth", "intrinsics", "extrinsics")))
         self.queries = self["in.query_point"][None]
         self.space = make_space("camera" if self.config.get("eval_mode") == "local" else "world")
@@ -128,7 +128,7 @@ def _forced_window(golden, name, start, stop, columns):
         golden[f"{name}.mean_coords"].view(1, 1, 1, 3), golden[f"{name}.std_coords"].view(1, 1, 1, 3), config.norm_scale
     )
     scene = _scene(golden, golden["image_feats"][None, : len(golden.frames)]).cut(start, stop)
-    levels, kept = [], []
+    levels, kept, supports = [], [], []
     for i, level in enumerate(scene.levels):
         points = golden[f"{name}.pyr{i}.norm_coords"][None, start:stop].movedim(2, -1)
         features = golden[f"pyr{i}.feats"][None, start:stop].movedim(2, -1)
@@ -137,7 +137,8 @@ def _forced_window(golden, name, start, stop, columns):
         pick = columns if features.shape[1] != len(columns) else slice(None)
         support = Neighbors(features[:, pick], offsets[:, pick], torch.zeros_like(offsets[:, pick, 0]))
         kept.append(tracker.context.describe(i, support))
-    return Window(scene, norm, levels, kept)
+        supports.append(support)
+    return Window(scene, norm, levels, kept, support=supports)
 
 
 def _window(golden, report, name, start, stop):
@@ -175,7 +176,7 @@ def _first_iteration(golden, report, step, window, seen):
     if f"{step[:2]}.n2n_l0_support_tokens" in golden or f"{step}.n2n_l0_support_tokens" in golden:
         prefix = step if f"{step}.n2n_l0_support_tokens" in golden else step[:2]
         support = golden[f"{prefix}.n2n_l0_support_tokens"]
-        report.add("support tokens", window.kept[0][0], support, 3e-4)
+        report.add("support tokens", N2N.describe(tracker.context, 0, window.support[0])[0], support, 3e-4)
         near, theirs = seen.near[0], golden[f"{prefix}.n2n_l0_context_tokens"]
         ours = (near.features + tracker.context.embed.offset(0, near.offsets))[0].flatten(0, 1)
         orders = near.indices[0].flatten(0, 1).argsort(-1), golden[f"{step}.context_knn_idx0"].flatten(0, 1).argsort(-1)
@@ -258,10 +259,10 @@ def measure_bidirectional(path):
 @torch.no_grad()
 def measure_checkpoint(path):
     """A checkpoint file in the authors' format, in both spaces."""
-    from tapip3d_lite.model.weights import load_official
+    from tapip3d_lite.official import load_official
 
     golden, report = Golden(path), Report()
-    tracker = load_official(path.with_name("checkpoint_small.pth"))
+    tracker = load_official(path.with_name("checkpoint_small.pth"), FAST)
     report.add("features", tracker.encoder(golden.frames.rgb[:, :1])[0, 0], golden["image_feats_f0"], 1e-5)
     for prefix, space in (("raw.", "world"), ("local.", "camera")):
         part = Report()

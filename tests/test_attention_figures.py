@@ -6,8 +6,8 @@ import torch
 from matplotlib.patches import ConnectionPatch
 
 import tapip3d_lite as t3d
+from lessons.n04_figures import WAYS, Pair, cell_centers, entropy, fourier_waves, rates, two_bags, who_looks_where
 from tapip3d_lite.geometry import project
-from lessons.n04_figures import Pair, WAYS, cell_centers, entropy, fourier_waves, rates, two_bags, who_looks_where
 
 K = 4
 

@@ -14,8 +14,8 @@ from torch import nn
 
 import tapip3d_lite as t3d
 from tests.bench import bench
-from tests.bench.timing import extra_memory, own_clock, ratios, side_by_side, stages
 from tests.bench.speed_figure import speed
+from tests.bench.timing import extra_memory, own_clock, ratios, side_by_side, stages
 
 LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory is read from /proc")
 
@@ -136,7 +136,7 @@ def test_model_rows_have_stages_equal_numbers_and_memory():
 
 def test_memory_and_scaling_parts(monkeypatch):
     monkeypatch.setattr(bench, "extra_memory", lambda prepare, *a: (float(prepare(*a)() is not None), 0.5))
-    from tapip3d_lite.model import inference
+    from tapip3d_lite.model import track as inference
 
     monkeypatch.setattr(inference, "_KEPT", inference._KEPT)  # restored afterwards
     rows = list(bench.bench_memory(quick=True))

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from lessons.samples import SAMPLES, longest_gap
 from tapip3d_lite import __main__
 from tapip3d_lite.clip import Tracks
 from tapip3d_lite.evaluation import benchmark, lite_splits
@@ -15,11 +16,10 @@ from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker
 from tapip3d_lite.evaluation.benchmark import difference_table, load_results, run_benchmark, save_results, summary_table
 from tapip3d_lite.evaluation.intervals import bootstrap_interval, paired_difference
 from tapip3d_lite.evaluation.lite_splits import FOLDER, SPLITS, benchmark_clips, differences, fingerprint
+from tapip3d_lite.figures.curves import score_figure
 from tapip3d_lite.lab.leaderboard import score_trackers
 from tapip3d_lite.simulate import record, render_clip, seeds, simulate_clip, simulator
 from tapip3d_lite.simulate.recording import load_recordings, save_recordings
-from lessons.samples import SAMPLES, longest_gap
-from tapip3d_lite.figures.curves import score_figure
 
 
 def same(a, b):

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from functools import cache
+from types import MethodType
 
 import pytest
 import torch
@@ -12,8 +13,9 @@ from torch._dynamo.utils import counters
 from torch._functorch import config as functorch
 
 import tapip3d_lite as t3d
-from tapip3d_lite.model.fourier import DEGREES
-from tapip3d_lite.model.support import _at_once
+from tapip3d_lite.model.blocks import DEGREES
+from tapip3d_lite.model.neighbors import KNearest
+from tapip3d_lite.speed.cuda_graph import support_at_once
 from tapip3d_lite.training.sampling import SamplingConfig
 from tapip3d_lite.training.trainer import Trainer
 from tests.test_trainer import SIZES, clips, recipe
@@ -50,8 +52,8 @@ def graphs(monkeypatch):
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf Tensor:UserWarning")
 def test_compiled_parts_take_the_same_steps(tmp_path, clips, graphs, monkeypatch):
     # Compiled, images are resized with other rounding (1e-6), which 2^13 x would make 1e-2 by the second update.
-    monkeypatch.setattr("tapip3d_lite.model.fourier._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
-    monkeypatch.setattr("tapip3d_lite.model.tracker.query_support", _at_once)  # as on a GPU
+    monkeypatch.setattr("tapip3d_lite.model.blocks._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
+    monkeypatch.setattr("tapip3d_lite.model.tracker.query_support", support_at_once)  # as on a GPU
     sampling = SamplingConfig(tracks=6, seen=1.0, anywhere=0.0)  # all are asked for in the first frame
     sizes = {"frames": 6, "sampling": sampling, "tracker": SIZES | {"time_depth": 2, "space_depth": 2}}  # two windows
     config = recipe(train_encoder=True, matching_steps=0, steps=2, evaluate_every=2, **sizes)
@@ -59,7 +61,8 @@ def test_compiled_parts_take_the_same_steps(tmp_path, clips, graphs, monkeypatch
     for compiled in (False, True):
         held_out = [t3d.load_clip(clips[0])]
         trainer = Trainer(tmp_path / f"{compiled}", config, clips, held_out, compiled=compiled)
-        trainer.tracker.neighborhood.fast = False  # trees are for a CPU, where nobody compiles
+        searches = trainer.tracker.neighborhood  # boxes are for a CPU, where nobody compiles
+        searches.search = MethodType(KNearest.search, searches)
         assert not graphs
         logs.append(list(trainer.steps()))
     one, other = ([[line[name] for name in ("loss", "norm")] for line in log] for log in logs)
@@ -68,5 +71,5 @@ def test_compiled_parts_take_the_same_steps(tmp_path, clips, graphs, monkeypatch
     assert not counters["graph_break"]
     # One for all updates, windows, steps and levels. Searches see two sizes of level, in a window and in the example;
     # blocks are one over time and three kinds over tracks.
-    assert graphs == {"N2N": 1, "Encoder": 1, "KNearest": 4, "Block": 4}
+    assert graphs == {"FoldedN2N": 1, "Encoder": 1, "BoxKNearest": 4, "Block": 4}
     assert counters["stats"]["unique_graphs"] == 10

@@ -9,12 +9,13 @@ import torch
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.model import encoder as module
-from tapip3d_lite.model import inference
+from tapip3d_lite.model import track as inference
 from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.contexts import N2N
-from tapip3d_lite.model.fast import get_ready
-from tapip3d_lite.model.neighbors import Neighbors
+from tapip3d_lite.model.n2n import N2N
+from tapip3d_lite.model.neighbors import KNearest, Neighbors
 from tapip3d_lite.model.tracker import Tracker
+from tapip3d_lite.speed.box_knn import BoxKNearest
+from tapip3d_lite.speed.folded_n2n import FoldedN2N, FoldedPair
 
 CONFIGS = {
     "one head": {},
@@ -60,8 +61,8 @@ def both(context, support, near):
     levels = range(2)
     kept = [context.describe(i, support) for i in levels]
     cells = replace(near, features=context.embed.features(near.features))
-    ready = get_ready(context, kept)
-    return [(context(i, kept[i], cells), context(i, ready[i], cells)) for i in levels]
+    folded = [FoldedPair.fold(context, i, kept[i]) for i in levels]
+    return [(context(i, kept[i], cells), folded[i].compare(cells)) for i in levels]
 
 
 @pytest.mark.parametrize("gradient", [False, True])
@@ -111,9 +112,9 @@ def test_float32_and_a_cut_of_the_tracks():
     with torch.no_grad():
         kept = [context.describe(i, support) for i in range(2)]
         cells = replace(near, features=context.embed.features(near.features))
-        ready = get_ready(context, kept)[1][:, 1:3]
+        folded = FoldedPair.fold(context, 1, kept[1])[:, 1:3]
         part = replace(cells, **{name: getattr(cells, name)[:, :, 1:3] for name in ("features", "points", "center")})
-        torch.testing.assert_close(context(1, ready, part), context(1, kept[1], cells)[:, :, 1:3], rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(folded.compare(part), context(1, kept[1], cells)[:, :, 1:3], rtol=1e-4, atol=1e-4)
 
 
 SMALL = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 64, "iterations": 1}
@@ -175,19 +176,27 @@ def test_memory_hardly_grows_with_the_length_of_a_long_clip(monkeypatch):
     assert long - short < 16 * frame / 8
 
 
-def test_the_encoder_takes_as_many_frames_at_once_as_suit_the_machine(monkeypatch):
+def test_the_encoder_takes_as_many_frames_at_once_as_fit_a_budget(monkeypatch):
     encoder, images = small_tracker().encoder, torch.rand(2, 5, 3, 32, 32)
     sizes = []
     encoder.stem.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
     with torch.no_grad():
-        monkeypatch.setattr(module, "_CPU_PIXELS", 3 * 32 * 32)
-        chunked = encoder(images)
-        encoder.fast = False
         whole = encoder(images)
-        encoder.fast = True
-        monkeypatch.setattr(module, "_CPU_PIXELS", 1)  # a frame at least
+        monkeypatch.setattr(module, "_PIXELS", 3 * 32 * 32)
+        chunked = encoder(images)
+        monkeypatch.setattr(module, "_PIXELS", 1)  # a frame at least
         single = encoder(images)
     learning = encoder(images)
-    assert sizes == [3, 3, 3, 1, 10, *[1] * 10, 10]
+    assert sizes == [10, 3, 3, 3, 1, *[1] * 10, 10]
     for other in (chunked, single, learning):
         torch.testing.assert_close(other, whole, rtol=1e-4, atol=1e-4)
+
+
+def test_the_registry_alone_chooses_the_form():
+    fast, clear = (Tracker(TrackerConfig.preset("lite", **SMALL), fast=fast) for fast in (True, False))
+    assert isinstance(fast.context, FoldedN2N) and isinstance(fast.neighborhood, BoxKNearest)
+    assert type(clear.context) is N2N and type(clear.neighborhood) is KNearest
+    clear.load_state_dict(fast.state_dict())  # the same parameters
+    clip = small_clip(6)
+    one, other = (tracker.eval().track(clip, support_grid=2) for tracker in (fast, clear))
+    np.testing.assert_allclose(one.xyz, other.xyz, atol=1e-4)

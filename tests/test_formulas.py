@@ -10,12 +10,12 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
+from lessons.formulas import Formula, Symbol, find_function, formula_table, formulas
 from tapip3d_lite.geometry import transform
 from tapip3d_lite.model.frames import Frames, frames_from_clip
-from tapip3d_lite.model.recorder import Recorder
+from tapip3d_lite.recorder import Recorder
 from tapip3d_lite.training.backward import saving_backward
 from tapip3d_lite.training.loss import LossConfig, Truth
-from lessons.formulas import Formula, Symbol, find_function, formula_table, formulas
 
 TABLE = Path(__file__).resolve().parents[1] / "notebooks" / "FORMULAS.md"
 # All sizes differ, so that no two letters can be mixed up.

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from tapip3d_lite.model import neighbors, organized
 from tapip3d_lite.model.cloud import Level, feature_cloud
 from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.model.neighbors import KNearest, knn
-from tapip3d_lite.model.organized import BlockTree
-from tapip3d_lite.model.parts import make_space
+from tapip3d_lite.model.registry import make_space
 from tapip3d_lite.model.spaces import fitted
+from tapip3d_lite.speed import box_knn as organized
+from tapip3d_lite.speed.box_knn import BlockTree, BoxKNearest, run_knn
 
 SAMPLES = sorted((Path(__file__).resolve().parents[1] / "data_samples").glob("*.npz"))
 
@@ -172,14 +172,15 @@ def test_the_tracker_searches_trees_where_that_pays(exclude, monkeypatch):
     g = torch.Generator().manual_seed(3)
     points = holes(g, 32, 32)[None]
     level = Level(torch.randn(1, 2, 32, 32, 4, generator=g), points, points.abs().sum(-1) > 0)
-    part = KNearest(t3d.TrackerConfig.preset("lite", exclude_invalid=exclude, neighbors=9))
+    config = t3d.TrackerConfig.preset("lite", exclude_invalid=exclude, neighbors=9)
     coords = adversarial_queries(g, points[0])[None]
-    monkeypatch.setattr(neighbors, "_FEW", 10**9)
-    brute = part(level, coords, None)
-    assert not level.memory
-    monkeypatch.setattr(neighbors, "_FEW", 0)
+    brute, part = KNearest(config)(level, coords, None), BoxKNearest(config)
+    monkeypatch.setattr(organized, "_FEW", 10**9)
+    few = part(level, coords, None)
+    assert torch.equal(few.indices, brute.indices) and not level.memory
+    monkeypatch.setattr(organized, "_FEW", 0)
     fast = part(level, coords, None)
-    assert isinstance(level.memory["tree"], BlockTree) and not level.cut(0, 1).memory
+    assert isinstance(level.memory["boxes"], BlockTree) and not level.cut(0, 1).memory
     for name in ("features", "points", "indices"):
         assert torch.equal(getattr(fast, name), getattr(brute, name))
 
@@ -190,3 +191,14 @@ def test_what_the_tree_leaves_to_brute_force():
     assert BlockTree.build(points.double()) is None
     points[0, 3, 3] = np.nan
     assert BlockTree.build(points) is None
+
+
+@pytest.mark.parametrize("masked", [False, True], ids=["all cells", "some cells"])
+@pytest.mark.parametrize("cloud", CLOUDS, ids=lambda f: f.__name__)
+@pytest.mark.parametrize("size", [(32, 32), (33, 40), (7, 5)], ids=str)
+def test_runs_of_cells_as_on_a_gpu_equal_brute_force(size, cloud, masked):
+    g = torch.Generator().manual_seed(5)
+    points = cloud(g, *size)
+    queries, flat = adversarial_queries(g, points), points.flatten(1, 2)
+    valid = torch.rand(flat.shape[:2], generator=g) < 0.3 if masked else None
+    assert torch.equal(run_knn(queries, flat, 9, valid), knn(queries, flat, 9, valid))

@@ -9,7 +9,7 @@ from lessons import n04_matching as matching
 from lessons.n04_matching import paired_bags, similarity_attention, votes
 from tapip3d_lite.model.cloud import feature_cloud
 from tapip3d_lite.model.frames import frames_from_clip
-from tapip3d_lite.model.parts import make_space
+from tapip3d_lite.model.registry import make_space
 
 K = 6
 

@@ -7,16 +7,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from tapip3d_lite.model.attention import Attention, Block, Pool
+from tapip3d_lite.model.blocks import DEGREES, Attention, Block, Pool, _constant, constant, fourier, time_embedding
 from tapip3d_lite.model.cloud import Level, Normalizer, feature_cloud, nearest_exact, quantile_roi
 from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.constants import _constant, constant
-from tapip3d_lite.model.contexts import N2N, PairAttention
-from tapip3d_lite.model.fourier import DEGREES, fourier, time_embedding
-from tapip3d_lite.model.neighbors import KNearest, Neighbors, knn
-from tapip3d_lite.model.support import bilinear
-from tapip3d_lite.model.tokens import token_width, trajectory_tokens
-from tapip3d_lite.model.updater import Transformer
+from tapip3d_lite.model.n2n import N2N, PairAttention
+from tapip3d_lite.model.neighbors import KNearest, Neighbors, bilinear, knn
+from tapip3d_lite.model.updater import Transformer, token_width, trajectory_tokens
 
 SMALL = {
     "image_size": (32, 48), "window": 4, "feature_dim": 8, "levels": 2, "neighbors": 3, "token_dim": 6,

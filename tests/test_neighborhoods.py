@@ -5,10 +5,10 @@ import pytest
 from matplotlib.patches import Circle
 
 from lessons.n03_cells import Cells, silhouettes, track_objects
+from lessons.n03_exercises import search, walls
+from lessons.n03_figures import RIGHT, WRONG, Around, neighborhoods_3d, proof_view, share_curves, two_neighborhoods
 from tapip3d_lite.geometry import point_map, project
 from tapip3d_lite.simulate import object_maps, record, render_clip
-from lessons.n03_exercises import search, walls
-from lessons.n03_figures import Around, RIGHT, WRONG, neighborhoods_3d, proof_view, share_curves, two_neighborhoods
 
 
 @pytest.fixture(scope="module")

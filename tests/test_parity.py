@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from tapip3d_lite.model.tracker import Tracker
 from tests import parity
 
 needs_golden = pytest.mark.skipif(not parity.GOLDEN.is_dir(), reason="the recorded runs are not beside this checkout")
@@ -11,14 +10,12 @@ needs_golden = pytest.mark.skipif(not parity.GOLDEN.is_dir(), reason="the record
 
 @pytest.fixture(autouse=True, params=["fast", "clear"])
 def _form(request, monkeypatch):
-    monkeypatch.setattr(Tracker, "fast", request.param == "fast")
+    monkeypatch.setattr(parity, "FAST", request.param == "fast")
 
 
 @needs_golden
 @pytest.mark.parametrize(("name", "function"), list(parity.measurements()))
 def test_every_recorded_stage(name, function):
-    if function is parity.measure_checkpoint:
-        pytest.importorskip("tapip3d_lite.model.weights")
     report = function(parity.GOLDEN / f"{name}.npz")
     assert len(report) >= 5
     assert not report.failures()

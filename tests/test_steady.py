@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tapip3d_lite.model.fourier import DEGREES
-from tapip3d_lite.model.support import _at_once
-from tapip3d_lite.training.replay import Replay
+from tapip3d_lite.model.blocks import DEGREES
+from tapip3d_lite.model.neighbors import KNearest
+from tapip3d_lite.speed.cuda_graph import CudaGraphStep
 from tapip3d_lite.training.sampling import SamplingConfig
 from tapip3d_lite.training.trainer import Trainer
 from tests.test_trainer import clips, recipe
@@ -34,14 +34,13 @@ class Asked(TorchDispatchMode):
 
 @pytest.fixture
 def trainer(tmp_path, clips, monkeypatch):
-    monkeypatch.setattr("tapip3d_lite.model.tracker.query_support", _at_once)  # as on a GPU
     # The order of sums differs with masked tracks, and 2^13 x would make much of the last bit.
-    monkeypatch.setattr("tapip3d_lite.model.fourier._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
+    monkeypatch.setattr("tapip3d_lite.model.blocks._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
     # Some tracks are asked for so late that they do not belong to the first window.
     late = {"sampling": SamplingConfig(tracks=6, anywhere=1.0, seen=0.0), "frames": (8, 8), "batch": 2}
     config = recipe(matching_steps=0, train_encoder=True, **late)
     trainer = Trainer(tmp_path, config, clips)
-    trainer.tracker.neighborhood.fast = False  # trees are for a CPU
+    trainer.tracker.neighborhood = KNearest(trainer.tracker.config)  # boxes are for a CPU
     return trainer
 
 
@@ -62,7 +61,7 @@ def test_a_steady_step_has_the_same_gradients(trainer):
     told, plain = gradients(trainer, batch)
     trainer._replay = trainer._add_gradients
     told_steady, steady = gradients(trainer, batch)
-    assert told_steady == pytest.approx(told, rel=1e-5) and not trainer.tracker.steady
+    assert told_steady == pytest.approx(told, rel=1e-5) and not trainer.tracker.sync_free
     assert alike(plain, steady)
 
 
@@ -114,8 +113,8 @@ def test_a_recording_is_made_for_each_length_and_gets_each_batch(trainer, monkey
 
     batches = [trainer.examples.batch(step) for step in range(3)]
     expected = [gradients(trainer, batch) for batch in batches]
-    monkeypatch.setattr(Replay, "_record", record)
-    trainer._replay = Replay(trainer._add_gradients, trainer.parameters)
+    monkeypatch.setattr(CudaGraphStep, "_record", record)
+    trainer._replay = CudaGraphStep(trainer._add_gradients, trainer.parameters)
     for batch, (told, plain) in zip(batches, expected, strict=True):
         again, replayed = gradients(trainer, batch)
         assert again == pytest.approx(told, rel=1e-5)

@@ -6,7 +6,8 @@ import torch
 import tapip3d_lite as t3d
 from tapip3d_lite.model.frames import Frames, frames_from_clip
 from tapip3d_lite.model.spaces import fitted
-from tapip3d_lite.model.support import _at_once, query_support
+from tapip3d_lite.model.windows import query_support
+from tapip3d_lite.speed.cuda_graph import support_at_once
 from tests.test_trainer import SIZES
 
 WINDOW = {"neighborhood": "window", "context": "correlation", "neighbors": 9, "space": "uvd"}
@@ -35,7 +36,7 @@ def test_all_frames_at_once_give_what_one_after_another_gives(switches):
     coords = space.from_world(queries[..., None, 1:], *cameras)[:, :, 0]
     expected = query_support(tracker.neighborhood, scene, times, coords)
     assert len(expected) == 2 and len(times.unique()) == 6 and not torch.equal(times[0], times[1])
-    others = _at_once(tracker.neighborhood, scene, times, coords)
+    others = support_at_once(tracker.neighborhood, scene, times, coords)
     for one, other in zip(expected, others, strict=True):
         assert one.features.shape[:3] == (2, 10, 1 + tracker.config.neighbors)
         for name in ("features", "points", "center", "indices"):

@@ -8,11 +8,12 @@ import torch
 
 import tapip3d_lite as t3d
 from tapip3d_lite.model.cloud import Level
-from tapip3d_lite.model.contexts import P2N
-from tapip3d_lite.model.correlations import Correlation, PlaneCorrelation
-from tapip3d_lite.model.grids import EXTENT, Planes, Window, splat
 from tapip3d_lite.model.neighbors import Neighbors
-from tapip3d_lite.model.spaces import UV, UVD, UVLogD
+from tapip3d_lite.variants.correlation import Correlation
+from tapip3d_lite.variants.image_spaces import UV, UVD, UVLogD
+from tapip3d_lite.variants.p2n import P2N
+from tapip3d_lite.variants.planes import EXTENT, PlaneCorrelation, PlaneNeighborhood, splat
+from tapip3d_lite.variants.window2d import WindowNeighborhood
 
 TINY = {"image_size": (48, 48), "window": 4, "levels": 2, "iterations": 1, "feature_dim": 16, "token_dim": 16}
 
@@ -56,7 +57,7 @@ def test_window_is_the_loop_and_clamps_at_borders(count, exclude):
     cells = torch.tensor([[2.2, 1.7], [3.0, 2.0], [-3.0, 9.0], [6.4, 0.4]]).expand(1, 2, 4, 2)
     coords = torch.randn(1, 2, 4, 3, generator=generator(1))
     part = config(neighborhood="window", neighbors=count, exclude_invalid=exclude)
-    near = Window(part)(level, coords, cells)
+    near = WindowNeighborhood(part)(level, coords, cells)
     features, points, valid = level.features.flatten(2, 3), level.points.flatten(2, 3), level.valid.flatten(2, 3)
     for t, n in product(range(2), range(4)):
         pairs = list(naive_window(cells[0, t, n].tolist(), count, 5, 7))
@@ -74,7 +75,9 @@ def test_window_interpolates_for_correlation():
     ramp = torch.stack(torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij"), -1)[None, None]
     level = Level(ramp, torch.zeros(1, 1, height, width, 3), torch.ones(1, 1, height, width, dtype=torch.bool))
     cells = torch.tensor([[[[3.25, 2.5]]]])
-    near = Window(config(neighborhood="window", context="correlation"))(level, torch.zeros(1, 1, 1, 3), cells)
+    near = WindowNeighborhood(config(neighborhood="window", context="correlation"))(
+        level, torch.zeros(1, 1, 1, 3), cells
+    )
     expected = [[2.5 + dv, 3.25 + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)]
     torch.testing.assert_close(near.features[0, 0, 0], torch.tensor(expected))
 
@@ -147,7 +150,7 @@ def test_p2n_looks_with_the_query_alone():
 def test_plane_correlation_sums_three_planes():
     torch.manual_seed(0)
     part = config(neighborhood="planes", context="planes", space="uvlogd")
-    context, planes = PlaneCorrelation(part), Planes(part)
+    context, planes = PlaneCorrelation(part), PlaneNeighborhood(part)
     level = context.prepare(0, random_level(generator(6), channels=16))
     coords, cells = torch.randn(1, 2, 3, 3, generator=generator(7)), torch.rand(1, 2, 3, 2) * 4
     near = planes(level, coords, cells)
@@ -159,7 +162,7 @@ def test_plane_correlation_sums_three_planes():
         assert float(out[0, t, n, k]) == pytest.approx(expected, abs=1e-5)
     # The middle of the (x, z) window reads the splatted plane at the point's own x and z.
     side = level.extra[0].shape[1]
-    inner = Planes(part)(level, torch.zeros(1, 2, 1, 3), cells[:, :, :1])
+    inner = PlaneNeighborhood(part)(level, torch.zeros(1, 2, 1, 3), cells[:, :, :1])
     middle = (side - 1) / 2
     low, high = int(np.floor(middle)), int(np.ceil(middle))
     expected = level.extra[0][0, [low, low, high, high], [low, high, low, high]].mean(0)

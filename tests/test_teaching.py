@@ -7,7 +7,18 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from lessons.teaching import handout, minutes, read_notebook, solution_copy, solution_of, stubs, tags, tasks, timing_plan, write_pack
+from lessons.teaching import (
+    handout,
+    minutes,
+    read_notebook,
+    solution_copy,
+    solution_of,
+    stubs,
+    tags,
+    tasks,
+    timing_plan,
+    write_pack,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("[0-9][0-9]_*.ipynb"))

@@ -9,13 +9,13 @@ import torch
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert, transform
-from tapip3d_lite.model.contexts import Context
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
+from tapip3d_lite.model.n2n import Context
 from tapip3d_lite.model.neighbors import KNearest
-from tapip3d_lite.model.official import from_official_state
 from tapip3d_lite.model.spaces import World
 from tapip3d_lite.model.tracker import Tracker, TrackerConfig
 from tapip3d_lite.model.windows import State, window_ends
+from tapip3d_lite.official import from_official_state
 from tests import parity
 from tests.test_model import SMALL
 

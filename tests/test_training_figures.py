@@ -10,6 +10,10 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
+from lessons.n02_figures import MOVING
+from lessons.n06_augmentations import TITLES, before_and_after, motion_paths
+from lessons.n06_chain import Chain, plain, saving
+from lessons.n06_live import LivePlot, learning_curve, learning_curves, tracks_and_truth, train_live
 from tapip3d_lite import commands
 from tapip3d_lite.simulate import simulate_dataset
 from tapip3d_lite.training import plan
@@ -17,10 +21,6 @@ from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.plan import fit_to_time
 from tapip3d_lite.training.sampling import SamplingConfig
 from tapip3d_lite.training.trainer import Trainer
-from lessons.n06_augmentations import TITLES, before_and_after, motion_paths
-from lessons.n06_chain import Chain, plain, saving
-from lessons.n02_figures import MOVING
-from lessons.n06_live import LivePlot, learning_curve, learning_curves, tracks_and_truth, train_live
 
 SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
 SIZES |= {"context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2}

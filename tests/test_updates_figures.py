@@ -5,11 +5,11 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from tapip3d_lite.geometry import project
-from tapip3d_lite.model.tokens import token_width
-from tapip3d_lite.model.windows import window_ends
 from lessons.n05_exercises import window_starts
 from lessons.n05_figures import converging, film, paired, token_bar, token_parts, windows_chart, without
+from tapip3d_lite.geometry import project
+from tapip3d_lite.model.updater import token_width
+from tapip3d_lite.model.windows import window_ends
 
 
 @pytest.fixture(scope="module")

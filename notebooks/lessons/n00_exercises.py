@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tapip3d_lite.geometry import invert, transform, unproject
 from lessons.checker import Exercise, Mistake
 from lessons.n01_exercises import random_extrinsics, random_intrinsics
+from tapip3d_lite.geometry import invert, transform, unproject
 
 Array = np.ndarray
 

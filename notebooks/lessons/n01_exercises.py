@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tapip3d_lite.geometry import invert, resize_intrinsics, transform, unproject
 from lessons.checker import Exercise, Mistake
+from tapip3d_lite.geometry import invert, resize_intrinsics, transform, unproject
 
 Array = np.ndarray
 

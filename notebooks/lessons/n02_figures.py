@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tapip3d_lite.clip import Clip
 from lessons.n02_straightness import bend, fit_windows, to_space
+from tapip3d_lite.clip import Clip
 from tapip3d_lite.figures.flat import INK, _image, _plot
 
 STILL, MOVING, FIT = "#2b6cb0", "#d1495b", "#e8a33d"

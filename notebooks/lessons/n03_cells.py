@@ -17,10 +17,10 @@ from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import point_map, project
 from tapip3d_lite.model.cloud import Level, nearest_exact
 from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.grids import Window
 from tapip3d_lite.model.neighbors import KNearest
+from tapip3d_lite.variants.window2d import WindowNeighborhood
 
-KINDS = {"window": Window, "knn": KNearest}
+KINDS = {"window": WindowNeighborhood, "knn": KNearest}
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from tapip3d_lite.clip import Clip
 from lessons.n03_cells import Cells, track_objects
-from tapip3d_lite.geometry import project, transform, unproject
+from tapip3d_lite.clip import Clip
 from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
 from tapip3d_lite.figures.scene_3d import _limits, _step_args
+from tapip3d_lite.geometry import project, transform, unproject
 
 QUERY, RIGHT, WRONG = "#e8a33d", "#2b6cb0", "#d1495b"
 NAMES = {"window": "window in the image", "knn": "k-NN in 3D"}

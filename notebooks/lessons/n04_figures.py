@@ -13,10 +13,10 @@ from matplotlib.patches import ConnectionPatch
 from matplotlib.ticker import ScalarFormatter
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.geometry import project
-from tapip3d_lite.model.fourier import DEGREES, fourier
-from tapip3d_lite.model.recorder import LevelRecord, StepRecord
 from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
+from tapip3d_lite.geometry import project
+from tapip3d_lite.model.blocks import DEGREES, fourier
+from tapip3d_lite.recorder import LevelRecord, StepRecord
 
 OWN, SUPPORT, CONTEXT = "#e8a33d", "#2b6cb0", "#d1495b"
 WAYS = ("support looks at context", "context looks at support")

@@ -11,13 +11,13 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from tapip3d_lite.clip import Clip
-from tapip3d_lite.geometry import project
-from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.fourier import FACTOR, fourier
-from tapip3d_lite.model.frames import frames_from_clip
 from lessons.n05_exercises import hand_over
+from tapip3d_lite.clip import Clip
 from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
+from tapip3d_lite.geometry import project
+from tapip3d_lite.model.blocks import FACTOR, fourier
+from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.frames import frames_from_clip
 
 ESTIMATE, TRUTH = "#e8a33d", "#2b6cb0"
 PARTS = ("motion", "virtual tracks")

@@ -9,13 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lessons.n02_figures import MOVING, STILL
 from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
 from tapip3d_lite.geometry import invert, project
 from tapip3d_lite.training.augment import AugmentConfig, augmentations
 from tapip3d_lite.training.motion import MotionConfig, move, smooth_motion
 from tapip3d_lite.training.reframing import flip_time
-from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
-from lessons.n02_figures import MOVING, STILL
 
 TITLES = {
     "erase": "eraser",

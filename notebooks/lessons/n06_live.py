@@ -13,14 +13,14 @@ from IPython.display import display
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lessons.n02_figures import MOVING, STILL
 from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.figures import png_bytes
+from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
 from tapip3d_lite.geometry import project
 from tapip3d_lite.lab.train import interruptible
 from tapip3d_lite.training.journal import read_log
 from tapip3d_lite.training.trainer import Trainer
-from tapip3d_lite.figures import png_bytes
-from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
-from lessons.n02_figures import MOVING, STILL
 
 Line = Mapping[str, Any]
 _SERIES = {"apd": ("all points", STILL), "apd_dynamic": ("moving points", MOVING)}

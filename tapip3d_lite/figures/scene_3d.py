@@ -10,8 +10,8 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from tapip3d_lite.clip import Clip, Tracks
-from tapip3d_lite.geometry import invert, transform, unproject
 from tapip3d_lite.figures.flat import check_drawable, track_colors
+from tapip3d_lite.geometry import invert, transform, unproject
 
 _LEVELS = 12  # colour levels per channel: a code into 1728 colours costs two bytes a point, an RGB string twenty
 

@@ -1,1 +1,1 @@
-"""The tracker, one idea a file; read in the order config, frames, spaces, encoder, cloud, neighbors, contexts, updater, tracker."""
+"""The paper, top to bottom: config, frames, spaces, encoder, cloud, neighbors, blocks, n2n, updater, windows, tracker."""

@@ -1,6 +1,9 @@
 """The multi-scale feature cloud: at every level a grid of cells, each with a feature and a 3D point; and its scale.
 
-Paper: section 3.2 ("spatio-temporal feature clouds") and appendix (normalisation of coordinates).
+    F_{l+1} = 2 x 2 average of F_l,   P_l(cell) = point of the full-resolution pixel nearest to the cell's centre
+    x_norm  = (x - mean) / std * scale,  over the valid points of a window
+
+Paper: section 3.2 (multi-scale feature clouds); the normalisation is the released code's.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ class Level:
         valid: (B, T, h, w) bool, whether the cell's depth is known.
         extra: anything that a context's `prepare` adds for its neighbourhood, e.g. feature planes; tensors with gradient
             in it stand in lists, tuples or dicts, where the memory-saving backward finds them.
-        memory: what neighbourhoods made of the points, e.g. a search tree; copies with other points start empty.
+        memory: what neighbourhoods made of the points, e.g. bounding boxes; copies with other points start empty.
     """
 
     features: Tensor
@@ -66,10 +69,10 @@ def feature_cloud(features: Tensor, points: Tensor, valid: Tensor, levels: int) 
     batch, count = features.shape[:2]
     maps, cloud = features.flatten(0, 1), []
     for level in range(levels):
-        maps = F.avg_pool2d(maps, 2) if level else maps
+        maps = F.avg_pool2d(maps, 2) if level else maps  # (B T, C, h, w)
         rows = nearest_exact(points.shape[2], maps.shape[-2], points.device)
         columns = nearest_exact(points.shape[3], maps.shape[-1], points.device)
-        cells = maps.movedim(1, -1).unflatten(0, (batch, count))
+        cells = maps.movedim(1, -1).unflatten(0, (batch, count))  # (B, T, h, w, C)
         cloud.append(Level(cells, points[:, :, rows][:, :, :, columns], valid[:, :, rows][:, :, :, columns]))
     return cloud
 
@@ -120,7 +123,7 @@ class Normalizer:
             raise ValueError(
                 "depths: a window has no valid point inside depth_roi, so coordinates have no scale; widen depth_roi"
             )
-        flat = points.flatten(1, 3)
+        flat = points.flatten(1, 3)  # (B, P, 3)
         mean = torch.where(weight, flat, 0).sum(1, keepdim=True) / count
         square = torch.where(weight, flat - mean, 0).square()
         axes = (1, 2) if mode == "isotropic" else 1

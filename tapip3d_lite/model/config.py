@@ -1,6 +1,6 @@
 """`TrackerConfig`: every system that the paper compares is one value of this dataclass.
 
-Paper: section 3 (the method), tables 4 to 7 (the ablations; one field each). The defaults are the released model.
+Paper: section 3.2 (the method) and the ablations, one field each. The defaults are the released model.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class TrackerConfig:
     Attributes:
         space: where a trajectory lives; a name or a `spaces.Space`.
         neighborhood: which cells a point looks at; a name or a callable (see `neighbors.KNearest`).
-        context: what it makes of them; a name or a `contexts.Context`, as a class or a module.
+        context: what it makes of them; a name or a `n2n.Context`, as a class or a module.
         updater: how trajectories are corrected; a name or a module (see `updater.Transformer`), as a class or a module.
         image_size: (H, W) pixels that the tracker works at.
         window: S frames that are solved together, even; the next window starts S / 2 later.

@@ -1,6 +1,8 @@
 """The image encoder: CoTracker's residual CNN.
 
-Paper: section 3.2 ("a CNN extracts feature maps"); the architecture is CoTracker's "BasicEncoder".
+    F = head(relu(norm(fuse(concat of the four stages, resized to (H, W) / stride))))
+
+Paper: section 3.2 (feature maps); the architecture is CoTracker's "BasicEncoder".
 """
 
 from __future__ import annotations
@@ -13,8 +15,9 @@ from torch import Tensor, nn
 
 from tapip3d_lite.model.config import TrackerConfig
 
-_CHUNK = 16  # frames encoded at once without gradient; frames are independent, so this only bounds memory
-_CPU_PIXELS = 2**18  # and on a CPU their pixels: maps that stay near the cache take less time, too
+_PIXELS = (
+    2**18
+)  # encoded at once without gradient: frames are independent, so this only bounds memory; on a GPU 16 times
 
 
 class ResidualBlock(nn.Module):
@@ -35,13 +38,7 @@ class ResidualBlock(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Images to feature maps: four residual stages, resized to one size, concatenated and fused.
-
-    Attributes:
-        fast: encode as many frames at once as suit the machine; False: as many as memory should bear.
-    """
-
-    fast = True
+    """Images to feature maps: four residual stages, resized to one size, concatenated and fused."""
 
     def __init__(self, config: TrackerConfig) -> None:
         super().__init__()
@@ -64,20 +61,11 @@ class Encoder(nn.Module):
         Returns:
             (B, T, C, H // stride, W // stride) float32.
         """
-        images = rgb.flatten(0, 1)
-        if torch.is_grad_enabled():
-            step = len(images)
-        elif self.fast and images.device.type == "cpu":
-            step = min(_CHUNK, max(1, _CPU_PIXELS // images[0, 0].numel()))
-        else:
-            step = _CHUNK
-        if step >= len(images):
-            return self._encode(images).float().unflatten(0, rgb.shape[:2])
-        size = (self.head.out_channels, images.shape[2] // self.stride, images.shape[3] // self.stride)
-        features = images.new_empty(len(images), *size, dtype=torch.float32)
-        for chunk, part in zip(images.split(step), features.split(step), strict=True):  # never two copies of them
-            part.copy_(self._encode(chunk))
-        return features.unflatten(0, rgb.shape[:2])
+        images = rgb.flatten(0, 1)  # (B T, 3, H, W)
+        budget = _PIXELS * (16 if rgb.is_cuda else 1)
+        step = len(images) if torch.is_grad_enabled() else max(1, budget // rgb[0, 0, 0].numel())
+        maps = [self._encode(part).float() for part in images.split(step)]
+        return (maps[0] if len(maps) == 1 else torch.cat(maps)).unflatten(0, rgb.shape[:2])  # (B, T, C, h, w)
 
     def _encode(self, images: Tensor) -> Tensor:
         size = images.shape[-2] // self.stride, images.shape[-1] // self.stride

@@ -1,6 +1,8 @@
 """`Frames`: a batch of posed RGB-D videos as tensors, and how a clip is brought to the model's image size.
 
-Paper: section 3.1 (the input).
+    fx' = fx (W' - 1) / (W - 1),   depth' = resized depth / resized validity
+
+Paper: section 3.2 (the input); resizing follows the released code.
 """
 
 from __future__ import annotations
@@ -83,8 +85,8 @@ def frames_from_clip(clip: Clip, size: tuple[int, int] | None = None, device: to
         device: where the tensors go.
     """
     clip = clip if size is None else resize_clip(clip, size)
-    rgb = _tensor(clip.video).to(device).movedim(-1, 1).float() / 255
-    others = (_tensor(x).to(device)[None] for x in (clip.depths, clip.intrinsics, clip.extrinsics))
+    rgb = _tensor(clip.video).to(device).movedim(-1, 1).float() / 255  # (T, H, W, 3) -> (T, 3, H, W)
+    others = (_tensor(x).to(device)[None] for x in (clip.depths, clip.intrinsics, clip.extrinsics))  # B = 1
     return Frames(rgb[None], *others)
 
 

@@ -1,7 +1,9 @@
 """Neighbourhoods: the K cells of a frame's cloud that lie nearest to a point in 3D.
 
-Paper: section 3.3 ("local pair attention", k-NN in 3D) and table 6 (against windows in 2D). Two cells that touch in
-the image but lie on different surfaces are far apart here, so a neighbourhood does not mix them.
+    N_t(x) = the K cells j of frame t with the smallest |p_j - x|^2,   offsets o_j = p_j - x
+
+Paper: section 3.2 (k-NN in 3D; its ablation compares a fixed window in 2D). Two cells that touch in the image but lie
+on different surfaces are far apart here, so a neighbourhood does not mix them.
 
 A neighbourhood is any callable with the signature of `KNearest.forward`.
 """
@@ -15,11 +17,9 @@ from torch import Tensor, nn
 
 from tapip3d_lite.model.cloud import Level, Normalizer
 from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.organized import INFINITE, BlockTree
 
 _BUDGET = 2**24  # distances that exist at once: 64 MiB in float32; on a GPU 16 times as many
-_FEW = 2**16  # distances that are computed sooner than a tree is searched
-_RUN = 8  # neighbouring cells that are looked at together
+INFINITE = int(torch.tensor(torch.inf).view(torch.int32))  # bits of non-negative floats order like the floats
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,7 @@ class Neighbors:
 
 
 class KNearest(nn.Module):
-    """The K cells nearest in 3D, nearest first.
-
-    Attributes:
-        fast: search trees where that is sooner than comparing with every cell; the result is the same.
-    """
-
-    fast: bool = True
+    """The K cells nearest in 3D, nearest first."""
 
     def __init__(self, config: TrackerConfig) -> None:
         super().__init__()
@@ -78,28 +72,17 @@ class KNearest(nn.Module):
         Returns:
             (B, S, N, K, ...) neighbours.
         """
-        shape = coords.shape[:2]
-        points, features = level.points.flatten(2, 3).flatten(0, 1), level.features.flatten(2, 3).flatten(0, 1)
+        frames = coords.shape[:2]
+        points, features = (x.flatten(2, 3).flatten(0, 1) for x in (level.points, level.features))  # (B S, h w, ...)
+        valid = level.valid.flatten(2, 3).flatten(0, 1) if self.exclude_invalid else None  # (B S, h w)
         with torch.no_grad():
-            indices = self._search(level, coords.flatten(0, 1), points)  # (B*S, N, K)
-        near = (gather(x, indices).unflatten(0, shape) for x in (features, points))
-        return Neighbors(*near, coords, indices.unflatten(0, shape))
+            indices = self.search(level, coords.flatten(0, 1), points, valid)  # (B S, N, K)
+        near = (gather(x, indices).unflatten(0, frames) for x in (features, points))  # (B, S, N, K, ...)
+        return Neighbors(*near, coords, indices.unflatten(0, frames))
 
-    def _search(self, level: Level, queries: Tensor, points: Tensor) -> Tensor:
-        valid = level.valid.flatten(0, 1) if self.exclude_invalid else None
-        if self.fast and queries.device.type == "cpu" and queries.shape[:2].numel() * points.shape[1] > _FEW:
-            if "tree" not in level.memory:
-                level.memory["tree"] = BlockTree.build(level.points.flatten(0, 1), valid)
-            if level.memory["tree"] is not None:
-                return level.memory["tree"].knn(queries, self.count)
-        return knn(queries, points, self.count, None if valid is None else valid.flatten(1))
-
-
-def gather(values: Tensor, indices: Tensor) -> Tensor:
-    """Rows of values (F, P, C) at indices (F, N, K) as (F, N, K, C)."""
-    first = torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1]
-    rows = values.flatten(0, 1).index_select(0, (first + indices).flatten())  # its backward needs no sorting on a GPU
-    return rows.view(*indices.shape, values.shape[2])
+    def search(self, level: Level, queries: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:
+        """Indices (F, N, K) of the cells (F, P, 3) of `level` nearest to queries (F, N, 3); valid (F, P) may be chosen."""
+        return knn(queries, points, self.count, valid)
 
 
 def knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = None) -> Tensor:
@@ -131,24 +114,28 @@ def _nearest(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) 
     distance = squared_distances(queries, points)  # (F, N, P)
     if valid is not None:
         distance.masked_fill_(~valid[:, None], torch.inf)
-    total, indices = distance.shape[-1], torch.arange(distance.shape[-1], device=distance.device)
-    if total % _RUN == 0 and total > 2 * _RUN * count:
-        # The K nearest lie in the K runs of cells whose nearest ones are nearest, ties included: fewer are sorted.
-        runs, _ = _smallest(distance.unflatten(-1, (-1, _RUN)).amin(-1), indices[: total // _RUN], count)
-        indices = (runs.unsqueeze(-1) * _RUN + indices[:_RUN]).flatten(-2)
-        distance = distance.gather(-1, indices)
-    indices, infinite = _smallest(distance, indices, count)
-    if valid is not None:
-        indices = torch.where(infinite, torch.where(infinite[..., :1], 0, indices[..., :1]), indices)
-    return indices
+    return nearest_first(distance, torch.arange(distance.shape[-1], device=distance.device), count, valid is not None)
 
 
-def _smallest(distance: Tensor, indices: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The indices (F, N, K) of the smallest distances (F, N, P), lowest index first among equals; which are infinite."""
+def nearest_first(distance: Tensor, indices: Tensor, count: int, masked: bool) -> Tensor:
+    """The indices with the smallest distances, lowest index first among equals.
+
+    Args:
+        distance: (F, N, P), not negative; infinite where a point may not be chosen.
+        indices: (P,) or (F, N, P) int64.
+        count: K.
+        masked: fill the slots of points that may not be chosen, see `knn`.
+
+    Returns:
+        (F, N, K) int64, nearest first.
+    """
     # The bits of a non-negative float order like the float itself, so one integer holds (distance, index).
     key = (distance.view(torch.int32).long() << 32) + indices
-    near = key.topk(count, dim=-1, largest=False).values
-    return near & 0xFFFFFFFF, (near >> 32) == INFINITE
+    near = key.topk(count, dim=-1, largest=False).values  # (F, N, P) -> (F, N, K)
+    indices, infinite = near & 0xFFFFFFFF, (near >> 32) == INFINITE
+    if masked:
+        indices = torch.where(infinite, torch.where(infinite[..., :1], 0, indices[..., :1]), indices)
+    return indices
 
 
 def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
@@ -157,3 +144,28 @@ def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
     for axis in (1, 2):
         total += (queries[:, :, None, axis] - points[:, None, :, axis]).square_()
     return total
+
+
+def gather(values: Tensor, indices: Tensor) -> Tensor:
+    """Rows of values (F, P, C) at indices (F, N, K) as (F, N, K, C)."""
+    first = torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1]
+    rows = values.flatten(0, 1).index_select(0, (first + indices).flatten())  # its backward needs no sorting on a GPU
+    return rows.view(*indices.shape, values.shape[2])  # (F N K, C) -> (F, N, K, C)
+
+
+def bilinear(grid: Tensor, cells: Tensor) -> Tensor:
+    """Interpolate a grid (B, h, w, C) at cells (B, N, 2) = (column, row), clamped to the border; (B, N, C)."""
+    height, width, channels = grid.shape[1:]
+    x, y = cells[..., 0].clamp(0, width - 1), cells[..., 1].clamp(0, height - 1)
+    left, top = x.floor().clamp(max=max(width - 2, 0)), y.floor().clamp(max=max(height - 2, 0))
+    right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
+    a, b = (x - left).unsqueeze(-1), (y - top).unsqueeze(-1)  # (B, N) -> (B, N, 1)
+    flat = grid.flatten(1, 2)  # (B, h, w, C) -> (B, h w, C)
+
+    def at(row: Tensor, column: Tensor) -> Tensor:
+        index = (row * width + column).long().unsqueeze(-1)  # (B, N, 1)
+        return flat.gather(1, index.expand(-1, -1, channels))  # (B, N, C)
+
+    upper = at(top, left) * (1 - a) + at(top, right) * a
+    lower = at(bottom, left) * (1 - a) + at(bottom, right) * a
+    return upper * (1 - b) + lower * b

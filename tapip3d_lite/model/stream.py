@@ -1,12 +1,14 @@
 """Tracking while frames come in: push frames, get each window's tracks as soon as it is complete.
 
-Paper: section 3.4; sliding windows look S frames ahead and no further, so nothing else of the video is needed. The
+    push(frame t):  the S newest frames are kept;  at t + 1 = S, S + S/2, … one window is solved
+
+Paper: section 3.2. Sliding windows look S frames ahead and no further, so nothing else of the video is needed. The
 result equals the offline tracker's forward pass on the same frames.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,13 +16,11 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip, Tracks
-from tapip3d_lite.model import inference
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.model.neighbors import Neighbors
-from tapip3d_lite.model.parts import make_space
-from tapip3d_lite.model.scene import to_world
 from tapip3d_lite.model.spaces import fitted
-from tapip3d_lite.model.windows import State
+from tapip3d_lite.model.track import check_options
+from tapip3d_lite.model.windows import Scene, State, Step
 from tapip3d_lite.queries import grid_queries
 from tapip3d_lite.validate import floats
 
@@ -33,9 +33,10 @@ class Stream:
         queries: (N, 4) rows (t, x, y, z), world; t counts pushed frames and may lie in the future.
         space: as for `track`.
         iterations: M, the config's if None.
-        support_grid: side of a grid of extra queries on the first frame that are tracked along and never told.
+        support_grid: side of a grid of extra queries on the first frame that are tracked along and left out of the results.
         depth_roi: depths (near, far) that count for the scale; None: all. It cannot be found from the whole clip here.
         visible_threshold: probability from which a point counts as visible; the config's if None.
+        watch: called with every update.
 
     Raises:
         ValueError: queries that are no (N, 4) rows with whole frame numbers, or a bad option.
@@ -50,17 +51,18 @@ class Stream:
         support_grid: int = 0,
         depth_roi: tuple[float, float] | None = None,
         visible_threshold: float | None = None,
+        watch: Callable[[Step], None] | None = None,
     ) -> None:
-        threshold = inference.check_options(tracker, space, depth_roi, visible_threshold, support_grid)
+        threshold = check_options(tracker, space, depth_roi, visible_threshold, support_grid)
         if isinstance(depth_roi, str):
             raise ValueError(
                 f"depth_roi: a stream does not know the whole clip's depths, so {depth_roi!r} cannot work; give (near, far) or None"
             )
         if iterations is not None and iterations < 1:
             raise ValueError(f"iterations: expected at least 1, got {iterations}")
-        self.tracker, self.space, self.roi = tracker, make_space(space or tracker.space), depth_roi
+        self.tracker, self.space, self.roi = tracker, tracker.resolve_space(space), depth_roi
         self.iterations = tracker.config.iterations if iterations is None else iterations
-        self.threshold, self.grid = threshold, support_grid
+        self.threshold, self.grid, self.watch = threshold, support_grid, watch
         self.queries = _checked(queries)
         self._begin(self.queries)
         self.window: list[tuple[Frames, Tensor]] = []  # the last S frames with their features
@@ -81,7 +83,7 @@ class Stream:
 
         Returns:
             When a window is complete the tracks of its S frames, the last one being this frame; else None. Frames of
-            the overlap with the window before are told again, improved.
+            the overlap with the window before are returned again, improved.
 
         Raises:
             ValueError: arrays that do not fit, as for `Clip`.
@@ -113,7 +115,7 @@ class Stream:
 
     def _push(self, frames: Frames, features: Tensor) -> Tracks | None:
         state, size, now = self.state, self.tracker.config.window, self.seen
-        flat = getattr(self.space, "moves", (1.0, 1.0, 1.0))[2] == 0
+        flat = getattr(self.space, "free_axes", (1.0, 1.0, 1.0))[2] == 0
         depth = frames.depths if flat else frames.depths[..., :1, :1].clone()  # only flat spaces need it once lifted
         self.cameras.append((frames.intrinsics, frames.extrinsics, depth))
         arriving = state.times[0] == now
@@ -143,25 +145,18 @@ class Stream:
             return self.space.to_world(coords, *cameras)[0].cpu().numpy()
 
     def _solve(self, start: int, stop: int) -> Tracks:
-        columns, mask = self.state.members(stop, None)
-        if len(columns):
-            frames = Frames(
-                *(torch.cat([getattr(f, name) for f, _ in self.window], 1) for name in Frames.__annotations__)
-            )
-            features = torch.cat([x for _, x in self.window], 1)
-            scene = replace(self.tracker.scene(frames, features, self.space, self.roi), start=start)
+        if bool((self.state.times < stop).any()):
+            parts = ([getattr(f, name) for f, _ in self.window] for name in Frames.__annotations__)
+            frames, features = Frames(*(torch.cat(x, 1) for x in parts)), torch.cat([x for _, x in self.window], 1)
+            scene = self.tracker.scene(frames, features, self.space, self.roi, start)
             self._add_support(scene, start, stop)
-            coords, logits = self.state.initial(start, stop, columns)
-            window = self.tracker.window(scene, [near.pick(columns) for near in self.support], mask, columns)
-            coords = window.norm.normalize(coords)
-            for _ in range(self.iterations):
-                coords, logits = self.tracker.update(window, coords, logits)
-            coords = window.norm.restore(coords)
-            self.state.write(start, stop, columns, mask, coords, logits)
-            self.xyz[start:stop, columns.cpu().numpy()] = to_world(coords, frames, self.space)[0].cpu().numpy()
+            for step in self.tracker.solve(scene, self.support, self.state, self.iterations):
+                if self.watch is not None:
+                    self.watch(step)
+            self.xyz[start:stop, step.columns.cpu().numpy()] = step.xyz[0].cpu().numpy()
         return self._tracks(start, stop)
 
-    def _add_support(self, scene: Any, start: int, stop: int) -> None:
+    def _add_support(self, scene: Scene, start: int, stop: int) -> None:
         """Collect the neighbourhoods of queries that this window is the first to contain."""
         half = self.tracker.config.window // 2
         times = self.state.times[0]

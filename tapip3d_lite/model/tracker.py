@@ -1,6 +1,11 @@
 """The tracker: sliding windows of iterative updates over a persistent feature cloud.
 
-Paper: section 3 and figure 2. `Tracker.steps` is the whole method; `forward` and `track` only collect its results.
+    F = encoder(rgb);  cloud = (F, lift(depth, K, E))                       features with 3D points, at L levels
+    in each window, M times:
+        tau_{m+1}, v_{m+1} = (tau_m, v_m) + updater(token(tau_m, v_m, N2N(support, cloud around tau_m)))        (3)
+
+Paper: section 3.2, equations 2 and 3. `Tracker.steps` is the whole method: the loop over windows, and in `solve` the
+loop over the updates of one. `forward`, `track`, `stream` and the training only collect what it yields.
 """
 
 from __future__ import annotations
@@ -13,26 +18,21 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip, Tracks
-from tapip3d_lite.model import inference
+from tapip3d_lite.model import track
+from tapip3d_lite.model.blocks import constant, time_embedding
 from tapip3d_lite.model.cloud import Normalizer, feature_cloud
 from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.constants import constant
-from tapip3d_lite.model.contexts import N2N
 from tapip3d_lite.model.encoder import Encoder
-from tapip3d_lite.model.fast import get_ready
-from tapip3d_lite.model.fourier import time_embedding
 from tapip3d_lite.model.frames import Frames
 from tapip3d_lite.model.neighbors import Neighbors
-from tapip3d_lite.model.parts import make_module, make_space
-from tapip3d_lite.model.scene import Scene, Step, Window, to_world
+from tapip3d_lite.model.registry import make_module, make_space
 from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.stream import Stream
-from tapip3d_lite.model.support import query_support
-from tapip3d_lite.model.tokens import token_width, trajectory_tokens
-from tapip3d_lite.model.windows import State, window_ends
+from tapip3d_lite.model.updater import token_width, trajectory_tokens
+from tapip3d_lite.model.windows import Scene, State, Step, Window, query_support, to_world, window_ends
 
 _CHUNK = 2**25  # floats of context tokens that exist at once without gradient: 128 MiB
-_CPU_CHUNK = 2**21  # there 8 MiB are twice as fast, since temporaries stay in the cache
+_CPU_CHUNK = 2**21  # on a CPU 8 MiB are twice as fast, since temporaries stay in the cache
 
 __all__ = ["Tracker", "TrackerConfig"]
 
@@ -40,43 +40,48 @@ __all__ = ["Tracker", "TrackerConfig"]
 class Tracker(nn.Module):
     """Tracks any points of a posed RGB-D video in 3D.
 
+    Args:
+        config: sizes and switches.
+        fast: use the fast form of each part that has one (`model.registry`); the numbers are the same.
+
     Attributes:
-        fast: compute N2N by `fast.Ready`, which gives the same numbers as the clear form in `contexts` sooner, in
-            pieces that fit a CPU's cache.
-        steady: do the same operations whatever the values are, without checking them: every track joins every window,
-            masked where it does not belong. Then nothing waits for a GPU, and a CUDA graph can hold a whole step.
+        sync_free: do the same operations whatever the values are, without checking them: every track joins every
+            window, masked where it does not belong. Then nothing waits for a GPU, and a CUDA graph can hold a whole step.
     """
 
-    fast: bool = True
-    steady: bool = False
+    sync_free: bool = False
 
-    def __init__(self, config: TrackerConfig) -> None:
+    def __init__(self, config: TrackerConfig, fast: bool = True) -> None:
         super().__init__()
         self.config = config
         self.space = make_space(config.space)
         self.encoder = Encoder(config)
-        self.neighborhood = make_module("neighborhood", config)
-        self.context = make_module("context", config)
+        self.neighborhood = make_module("neighborhood", config, fast=fast)
+        self.context = make_module("context", config, fast=fast)
         inputs = token_width(self.context.width, config.levels, config.use_uv)
-        self.updater = make_module("updater", config, inputs)
+        self.updater = make_module("updater", config, inputs, fast=fast)
         self.register_buffer("time", time_embedding(config.window, inputs), persistent=False)
 
-    def forward(self, frames: Frames, queries: Tensor, **options: Any) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, frames: Frames, queries: Tensor, watch: Callable[[Step], None] | None = None, **options: Any
+    ) -> tuple[Tensor, Tensor]:
         """Track forward in time.
 
         Args:
             frames: T frames at the config's image size.
             queries: (B, N, 4) rows (t, x, y, z), world.
+            watch: called with every update.
             options: as for `steps`.
 
         Returns:
             xyz (B, T, N, 3), world, and visibility logits (B, T, N). Before a query's first window, and in clips of
             at most S / 2 frames, the query's position and 0.
         """
-        space = fitted(make_space(options.get("space") or self.space), frames)
+        space = fitted(self.resolve_space(options.get("space")), frames)
         state = State.start(queries, frames, space, self.config.window // 2)
-        for _ in self.steps(frames, queries, state=state, **(options | {"space": space})):
-            pass
+        for step in self.steps(frames, queries, state=state, **(options | {"space": space})):
+            if watch is not None:
+                watch(step)
         count = len(frames)
         return to_world(state.coords[:, :count], frames, space), state.logits[:, :count]
 
@@ -91,7 +96,7 @@ class Tracker(nn.Module):
         depth_roi: tuple[float, float] | None = None,
         features: Tensor | None = None,
         state: State | None = None,
-        share: Callable[[Window], Window] = lambda window: window,
+        on_window: Callable[[Window], Window] | None = None,
     ) -> Iterator[Step]:
         """Yield every update of every window; the caller may backpropagate each at once (`retain_graph=True`).
 
@@ -104,47 +109,79 @@ class Tracker(nn.Module):
             depth_roi: depths (near, far) that count for the scale; None: all valid ones.
             features: (B, T, C, h, w) from `self.encoder`, if they exist already.
             state: trajectories, which are updated in place; made from the queries if None.
-            share: called with each window before its updates, for a caller that has its own way with what they share.
+            on_window: changes each window before its updates, e.g. to detach what they share.
         """
         config, iterations = self.config, self.config.iterations if iterations is None else iterations
         self._check(frames, iterations)
         if queries.shape[1] == 0:
             return
-        space, half = fitted(make_space(space or self.space), frames), config.window // 2
+        space = fitted(self.resolve_space(space), frames)
         features = self.encoder(frames.rgb) if features is None else features
-        state = State.start(queries, frames, space, half, not self.steady) if state is None else state
+        state = State.start(queries, frames, space, config.window // 2, not self.sync_free) if state is None else state
         scene = self.scene(frames, features, space, depth_roi)
         support = self.support(scene, queries, state.queries)
         for stop in window_ends(len(scene.frames), config.window):
-            start = stop - config.window
-            columns, mask = state.members(stop, active, self.steady)
-            if not len(columns):
-                continue
-            coords, logits = state.initial(start, stop, columns)
-            cut = scene.cut(start, stop)
-            window = share(self.window(cut, [near.pick(columns) for near in support], mask, columns))
-            coords = window.norm.normalize(coords)
-            for iteration in range(iterations):
-                # Nothing flows back from one iteration into the one before.
-                coords, logits = self.update(window, coords, logits)
-                yield Step(start, iteration, window.norm.restore(coords), logits, columns, mask, cut)
-                coords, logits = coords.detach(), logits.detach()
-            state.write(start, stop, columns, mask, window.norm.restore(coords), logits)
+            window = scene.cut(stop - config.window, stop)
+            yield from self.solve(window, support, state, iterations, active, on_window)
 
-    def scene(self, frames: Frames, features: Tensor, space: Any, depth_roi: tuple[float, float] | None) -> Scene:
-        """Lift frames to a feature cloud; frames and features are padded to whole half windows."""
+    def solve(
+        self,
+        scene: Scene,
+        support: list[Neighbors],
+        state: State,
+        iterations: int,
+        active: Tensor | None = None,
+        on_window: Callable[[Window], Window] | None = None,
+    ) -> Iterator[Step]:
+        """Update the tracks of one window M times, yield each update, then write the result into `state`.
+
+        Args:
+            scene: the window's S frames; `scene.start` says where in the clip they lie.
+            support: L times (B, N, 1 + K, ...), from `support`, of all tracks.
+            state: trajectories, read at the start and overwritten at the end.
+            iterations: M.
+            active: (B, N) bool, as for `steps`.
+            on_window: as for `steps`.
+        """
+        start, stop = scene.start, scene.start + len(scene.frames)
+        columns, mask = state.members(stop, active, self.sync_free)  # (n,), (B, n)
+        if not len(columns):
+            return
+        coords, logits = state.initial(start, stop, columns)  # (B, S, n, 3), (B, S, n)
+        window = self.window(scene, [near.pick(columns) for near in support], mask, columns)
+        window = window if on_window is None else on_window(window)
+        coords = window.norm.normalize(coords)
+        for iteration in range(iterations):
+            # Nothing flows back from one iteration into the one before.
+            coords, logits = self.update(window, coords, logits)
+            yield Step(start, iteration, window.norm.restore(coords), logits, columns, mask, scene)
+            coords, logits = coords.detach(), logits.detach()
+        state.write(start, stop, columns, mask, window.norm.restore(coords), logits)
+
+    def scene(
+        self, frames: Frames, features: Tensor, space: Any, depth_roi: tuple[float, float] | None, start: int = 0
+    ) -> Scene:
+        """Lift frames to a feature cloud; frames and features are padded to whole half windows.
+
+        Args:
+            frames: T frames.
+            features: (B, T, C, h, w).
+            space: where the points shall lie.
+            depth_roi: depths (near, far) that count for the scale, or None.
+            start: which frame of the clip is the first.
+        """
         with torch.autocast(frames.depths.device.type, enabled=False):
             half = self.config.window // 2
             padding = -len(frames) % half
             frames = frames.pad(half)
             if padding:
                 features = torch.cat([features, features[:, -1:].expand(-1, padding, -1, -1, -1)], 1)
-            points = space.lift(frames.depths, frames.intrinsics, frames.extrinsics)
+            points = space.lift(frames.depths, frames.intrinsics, frames.extrinsics)  # (B, T, H, W, 3)
             known = inside = frames.depths > 0
             if depth_roi is not None:
                 inside = known & (frames.depths >= depth_roi[0]) & (frames.depths <= depth_roi[1])
             levels = feature_cloud(features.to(points.dtype), points, known, self.config.levels)
-            return Scene(frames, points, inside, levels, space)
+            return Scene(frames, points, inside, levels, space, start)
 
     def support(self, scene: Scene, queries: Tensor, coords: Tensor) -> list[Neighbors]:
         """The queries' neighbourhoods, at each level, in un-normalised coordinates.
@@ -170,17 +207,17 @@ class Tracker(nn.Module):
             columns: (n,) which of all tracks these are; only looked at from outside.
         """
         config = self.config
-        norm = Normalizer.fit(scene.points, scene.valid, config.norm_mode, config.norm_scale, not self.steady)
+        norm = Normalizer.fit(scene.points, scene.valid, config.norm_mode, config.norm_scale, not self.sync_free)
         cloud = [replace(level, points=norm.normalize(level.points)) for level in scene.levels]
         levels = [self.context.prepare(i, level) for i, level in enumerate(cloud)]
         support = [near.normalized(norm) for near in support]
         kept = [self.context.describe(i, near) for i, near in enumerate(support)]
-        if not self.steady and bool(active.all()):
+        if not self.sync_free and bool(active.all()):
             active = None
         return Window(scene, norm, levels, kept, active, columns, support)
 
     def update(self, window: Window, coords: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-        """Update the trajectories of one window once (equation 1).
+        """Update the trajectories of one window once (equation 3).
 
         Args:
             window: from `window`.
@@ -193,12 +230,12 @@ class Tracker(nn.Module):
         frames = window.scene.frames
         with torch.autocast(coords.device.type, enabled=False):
             uv = window.scene.space.to_pixels(window.norm.restore(coords), frames.intrinsics, frames.extrinsics)
-        evidence = self.evidence(window, coords, uv)
+        evidence = self.evidence(window, coords, uv)  # (B, S, n, L * width)
         pixels = uv if self.config.use_uv else None
-        tokens = trajectory_tokens(coords, logits, evidence, pixels, frames.size, self.time)
-        delta = self.updater(tokens, window.active).to(coords.dtype)
-        moves = constant(tuple(getattr(window.scene.space, "moves", (1.0, 1.0, 1.0))), delta)
-        return coords + delta[..., :3] * moves, logits + delta[..., 3]
+        tokens = trajectory_tokens(coords, logits, evidence, pixels, frames.size, self.time)  # (B, S, n, token width)
+        delta = self.updater(tokens, window.active).to(coords.dtype)  # (B, S, n, 4 or 5): dx, dy, dz, dv
+        free = constant(tuple(getattr(window.scene.space, "free_axes", (1.0, 1.0, 1.0))), delta)
+        return coords + delta[..., :3] * free, logits + delta[..., 3]
 
     def evidence(self, window: Window, coords: Tensor, uv: Tensor) -> Tensor:
         """Collect each estimate's neighbourhood and compare it with the query's, at all levels.
@@ -211,36 +248,31 @@ class Tracker(nn.Module):
         Returns:
             (B, S, n, L * width).
         """
-        count, config = coords.shape[2], self.config
-        floats = coords.shape[0] * coords.shape[1] * config.neighbors * config.token_dim * 4
-        budget = min(_CHUNK, _CPU_CHUNK) if self.fast and coords.device.type == "cpu" else _CHUNK
+        batch, frames, count = coords.shape[:3]
+        floats = batch * frames * self.config.neighbors * self.config.token_dim * 4  # of one track
+        budget = _CPU_CHUNK if coords.device.type == "cpu" else _CHUNK
         step = count if torch.is_grad_enabled() else max(1, budget // floats)
-        ready, chunks = self.ready(window), []
+        chunks = []
         for rows in (slice(i, i + step) for i in range(0, count, step)):
             outputs = []
-            part = ready if step >= count else [kept[:, rows] for kept in ready]
-            for i, (level, kept) in enumerate(zip(window.levels, part, strict=True)):
-                near = self.neighborhood(level, coords[:, :, rows], level.cells(uv[:, :, rows], config.image_size))
-                outputs.append(self.context(i, kept, near))
-            chunks.append(torch.cat(outputs, -1))
+            for i, (level, kept) in enumerate(zip(window.levels, window.kept, strict=True)):
+                cells = level.cells(uv[:, :, rows], self.config.image_size)
+                near = self.neighborhood(level, coords[:, :, rows], cells)  # (B, S, rows, K, ...)
+                outputs.append(self.context(i, kept if step >= count else kept[:, rows], near))
+            chunks.append(torch.cat(outputs, -1))  # (B, S, rows, L * width)
         return torch.cat(chunks, 2)
 
-    def ready(self, window: Window) -> list:
-        """What the context remembers of the queries, in its fast form where it has one."""
-        if not (self.fast and isinstance(self.context, N2N)):
-            return window.kept
-        mode = torch.is_grad_enabled()
-        if mode not in window.ready:
-            window.ready[mode] = get_ready(self.context, window.kept)
-        return window.ready[mode]
-
     def track(self, clip: Clip, queries: Any = None, **options: Any) -> Tracks:
-        """Track points of one clip; see `inference.track` for the options."""
-        return inference.track(self, clip, queries, **options)
+        """Track points of one clip; `model.track.track` lists the options."""
+        return track.track(self, clip, queries, **options)
 
     def stream(self, queries: Any, **options: Any) -> Stream:
-        """Track while frames come in: `push` each, then `finish`; see `stream.Stream` for the options."""
+        """Track while frames come in: `push` each, then `finish`; `model.stream.Stream` lists the options."""
         return Stream(self, queries, **options)
+
+    def resolve_space(self, space: Any) -> Any:
+        """The space that a name or an object stands for; the tracker's own for None."""
+        return self.space if space is None else make_space(space) if isinstance(space, str) else space
 
     def _check(self, frames: Frames, iterations: int) -> None:
         if frames.size != self.config.image_size:

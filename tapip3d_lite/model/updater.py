@@ -1,7 +1,12 @@
-"""The trajectory updater: trajectories talk over time, and to each other through a few virtual tracks.
+"""The trajectory updater: tokens of all tracks and frames go in, corrections of positions and visibility come out.
 
-Paper: section 3.4. Attention among all N tracks would cost N^2; V virtual tracks read all of them, talk among
-themselves and write back, which costs N V.
+    token_t = [v_t | N2N of each level | fourier(tau_t - tau_{t+1}, tau_t - tau_{t-1}) | fourier(u, v)] + time_t     (2)
+    (d tau, d v) = transformer(tokens of all tracks);  tau += d tau,  v += d v                                       (3)
+
+Paper: section 3.2, equations 2 and 3. The paper writes the motion as tau_{t+1} - tau_t and appends the embedding of
+time; the released code, and so ours, takes "self minus neighbour", adds time to the whole token, and appends the pixel
+position. v is the logit of visibility. Attention among all N tracks would cost N^2; V virtual tracks read all of them,
+talk among themselves and write back, which costs N V (CoTracker3).
 
 An updater is any module with the signature of `Transformer.forward`.
 """
@@ -11,12 +16,44 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.model.attention import Block
+from tapip3d_lite.model.blocks import FACTOR, Block, constant, fourier
 from tapip3d_lite.model.config import TrackerConfig
 
 
+def token_width(context_width: int, levels: int, use_uv: bool) -> int:
+    """Channels of the token: 1 + levels * context_width + 6 * 33 (+ 2 * 33)."""
+    return 1 + levels * context_width + 6 * FACTOR + (2 * FACTOR if use_uv else 0)
+
+
+def trajectory_tokens(
+    coords: Tensor, logits: Tensor, evidence: Tensor, uv: Tensor | None, size: tuple[int, int], time: Tensor
+) -> Tensor:
+    """Assemble tokens.
+
+    Args:
+        coords: (B, S, N, 3) normalised.
+        logits: (B, S, N) visibility before the sigmoid.
+        evidence: (B, S, N, levels * width), what the context found at all levels.
+        uv: (B, S, N, 2) pixels, or None to leave them out.
+        size: (H, W) of the image.
+        time: (S, token width) embedding of time.
+
+    Returns:
+        (B, S, N, token width).
+    """
+    step = coords[:, :-1] - coords[:, 1:]  # (B, S - 1, N, 3), self minus next
+    still = torch.zeros_like(coords[:, :1])  # (B, 1, N, 3)
+    motion = torch.cat([torch.cat([step, still], 1), torch.cat([still, -step], 1)], -1)  # (B, S, N, 6)
+    parts = [logits.unsqueeze(-1), evidence.to(coords.dtype), fourier(motion)]  # (B, S, N, 1 | L width | 6 * 33)
+    if uv is not None:
+        sides = constant((float(size[1]), float(size[0])), uv)
+        # Points far outside the image would otherwise drive the Fourier features with arbitrary phases.
+        parts.append(fourier(torch.minimum(torch.maximum(uv, -2 * sides), 2 * sides) / (sides - 1)))
+    return torch.cat(parts, -1) + time[:, None]  # (B, S, N, token width) + (S, 1, token width)
+
+
 class Transformer(nn.Module):
-    """Blocks over time, each group followed by virtual <- points, virtual <- virtual, points <- virtual."""
+    """Blocks over time; after each group the virtual tracks read the points, talk among themselves and write back."""
 
     def __init__(self, config: TrackerConfig, inputs: int) -> None:
         super().__init__()
@@ -45,37 +82,17 @@ class Transformer(nn.Module):
         Returns:
             (B, S, N, at least 4): dx, dy, dz (normalised coordinates), change of the visibility logit.
         """
-        points = self.input(tokens)
+        points = self.input(tokens)  # (B, S, N, inputs) -> (B, S, N, U)
         batch, frames, count = points.shape[:3]
         x = torch.cat([points, self.virtual.to(points.dtype).expand(batch, frames, -1, -1)], 2)  # (B, S, N + V, U)
         mask = None if active is None else (active | ~active.any(-1, keepdim=True))[:, None]  # (B, 1, N)
         for i, block in enumerate(self.time):
-            x = block(x.transpose(1, 2)).transpose(1, 2)
+            x = block(x.transpose(1, 2)).transpose(1, 2)  # attention over S, for each track
             if i % self.every == 0:
                 points, virtual = x[:, :, :count], x[:, :, count:]
                 j = i // self.every
-                virtual = self.mix[j](self.gather[j](virtual, points, mask))
+                virtual = self.mix[j](self.gather[j](virtual, points, mask))  # (B, S, V, U)
                 x = torch.cat([self.scatter[j](points, virtual), virtual], 2)
-        points = x[:, :, :count]
+        points = x[:, :, :count]  # (B, S, N, U)
         out = self.head(points)
         return out if self.vis_head is None else torch.cat([out, self.vis_head(points)], -1)
-
-
-class Temporal(nn.Module):
-    """The same blocks over time and no attention across tracks: each trajectory is corrected alone."""
-
-    def __init__(self, config: TrackerConfig, inputs: int) -> None:
-        super().__init__()
-        self.input = nn.Linear(inputs, config.hidden)
-        sizes = config.hidden, config.heads, config.head_dim, config.mlp_ratio
-        self.time = nn.ModuleList(Block(*sizes) for _ in range(config.time_depth))
-        self.head = nn.Linear(config.hidden, 4)
-        nn.init.normal_(self.head.weight, std=1e-3)
-        nn.init.zeros_(self.head.bias)
-
-    def forward(self, tokens: Tensor, active: Tensor | None = None) -> Tensor:
-        """See `Transformer.forward`; `active` has no meaning where tracks do not meet."""
-        x = self.input(tokens).transpose(1, 2)
-        for block in self.time:
-            x = block(x)
-        return self.head(x.transpose(1, 2))

@@ -10,16 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from tapip3d_lite.model.fast import Ready
 from tapip3d_lite.model.frames import Frames
-from tapip3d_lite.model.scene import Step, Window
 from tapip3d_lite.model.tracker import Tracker
+from tapip3d_lite.model.windows import Step, Window
 from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
 
 
@@ -57,7 +55,7 @@ def add_gradients(
     whole, window = Leaves(), Leaves()
     leaf = whole.of(features)
     iterations, totals = options.get("iterations") or tracker.config.iterations, []
-    for step in tracker.steps(frames, queries, features=leaf, share=partial(window.shared, tracker), **options):
+    for step in tracker.steps(frames, queries, features=leaf, on_window=window.shared, **options):
         parts = step_loss(step, truth, iterations, config)
         sum(parts).backward()
         if step.iteration == iterations - 1:
@@ -90,22 +88,19 @@ class Leaves:
         self._pairs.append((tensor, leaf))
         return leaf
 
-    def shared(self, tracker: Tracker, window: Window) -> Window:
+    def shared(self, window: Window) -> Window:
         """The window with leaves for all that its updates share."""
-        ready = tracker.ready(window)
         levels = [replace(x, features=self.of(x.features), extra=self._all(x.extra)) for x in window.levels]
-        window = replace(window, levels=levels, ready={})
-        if isinstance(ready[0], Ready):
-            window.ready[True] = [level.map(self.of) for level in ready]
-            return window
-        return replace(window, kept=[self.of(level) for level in ready])
+        return replace(window, levels=levels, kept=[self._all(kept) for kept in window.kept])
 
-    def _all(self, extra: Any) -> Any:
-        if isinstance(extra, list | tuple):
-            return type(extra)(map(self._all, extra))
-        if isinstance(extra, dict):
-            return {name: self._all(value) for name, value in extra.items()}
-        return self.of(extra) if isinstance(extra, Tensor) else extra
+    def _all(self, value: Any) -> Any:
+        if isinstance(value, list | tuple):
+            return type(value)(map(self._all, value))
+        if isinstance(value, dict):
+            return {name: self._all(item) for name, item in value.items()}
+        if isinstance(value, Tensor):
+            return self.of(value)
+        return value.map(self.of) if hasattr(value, "map") else value
 
     def backward(self, retain_graph: bool = False) -> None:
         """Send what was collected back to where the tensors come from, and begin anew."""

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from tapip3d_lite.geometry import transform
-from tapip3d_lite.model.scene import Step
+from tapip3d_lite.model.windows import Step
 
 
 @dataclass(frozen=True)

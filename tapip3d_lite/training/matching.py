@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import project
-from tapip3d_lite.model.constants import constant
+from tapip3d_lite.model.blocks import constant
 from tapip3d_lite.training.augment import AugmentConfig, augment
 from tapip3d_lite.training.sampling import load_part
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.evaluation.evaluate import RASTER, evaluate, mean_scores
 from tapip3d_lite.geometry import transform
-from tapip3d_lite.model.scene import Step
 from tapip3d_lite.model.tracker import Tracker
+from tapip3d_lite.model.windows import Step
 from tapip3d_lite.training.data import Batch
 
 _THRESHOLDS = (1, 2, 4, 8, 16)  # pixels of the benchmark's raster

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.model.attention import Block
+from tapip3d_lite.model.blocks import Block
+from tapip3d_lite.model.registry import load_part
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
 from tapip3d_lite.training.backward import add_gradients, losses
@@ -25,7 +27,6 @@ from tapip3d_lite.training.examples import Examples
 from tapip3d_lite.training.journal import Journal
 from tapip3d_lite.training.matching import Pair, matching_loss
 from tapip3d_lite.training.parallel import Group
-from tapip3d_lite.training.replay import Replay
 from tapip3d_lite.training.scores import Accuracy, validate
 from tapip3d_lite.training.start import begin_with
 
@@ -207,13 +208,10 @@ class Trainer:
         accuracy = Accuracy(batch.queries.device)
         options = {"iterations": iterations, "depth_roi": batch.roi, "features": batch.features}
         options |= {"watch": lambda step: accuracy.add(step, batch, iterations)}
-        self.tracker.steady = self._replay is not None
-        try:
-            with self._precision():
-                example = batch.frames, batch.queries, batch.truth
-                return add_gradients(self.tracker, *example, self.config.loss, **options), accuracy.totals
-        finally:
-            self.tracker.steady = False
+        free = load_part("tapip3d_lite.speed.cuda_graph:sync_free")(self.tracker) if self._replay else nullcontext()
+        with free, self._precision():
+            example = batch.frames, batch.queries, batch.truth
+            return add_gradients(self.tracker, *example, self.config.loss, **options), accuracy.totals
 
     def _precision(self) -> torch.autocast:
         return torch.autocast(self.device, torch.bfloat16, enabled=self.config.precision == "bfloat16")
@@ -229,7 +227,8 @@ class Trainer:
         recipe = config.matching if self.matching else config
         self._clip_norm = recipe.clip_norm
         record = self.recorded and self._on_gpu
-        self._replay = Replay(self._add_gradients, self.parameters) if record else None
+        step = load_part("tapip3d_lite.speed.cuda_graph:CudaGraphStep") if record else None
+        self._replay = step(self._add_gradients, self.parameters) if record else None
         plain = [p for p in self.parameters if p.ndim < 2]  # biases and norms are not decayed
         decayed = [p for p in self.parameters if p.ndim >= 2]
         groups = [{"params": decayed, "weight_decay": recipe.weight_decay}, {"params": plain, "weight_decay": 0.0}]

@@ -16,18 +16,18 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from tapip3d_lite.clip import Clip
-from tests.bench.rows import Row, compared, table
-from tests.bench.timing import extra_memory, own_clock, side_by_side, stages
 from tapip3d_lite.model.cloud import feature_cloud
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.frames import frames_from_clip, resize_clip
 from tapip3d_lite.model.neighbors import knn
-from tapip3d_lite.model.organized import BlockTree
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.windows import window_ends
 from tapip3d_lite.simulate import simulate_clip
+from tapip3d_lite.speed.box_knn import BlockTree
 from tapip3d_lite.training.backward import saving_backward
 from tapip3d_lite.training.loss import LossConfig, Truth
+from tests.bench.rows import Row, compared, table
+from tests.bench.timing import extra_memory, own_clock, side_by_side, stages
 
 __all__ = ["PARTS", "Row", "bench", "table"]
 SLOW, FAST, SHORT, COMPILED = "straightforward", "fast", "fast, bf16", "fast, bf16, compiled"
@@ -203,7 +203,7 @@ def bench_memory(quick: bool = False, rounds: int = 1) -> Iterator[Row]:
 
 
 def _ready_track(frames: int, count: int, kept: int) -> Callable[[], Any]:
-    from tapip3d_lite.model import inference
+    from tapip3d_lite.model import track as inference
 
     inference._KEPT = kept
     tracker, clip = make_tracker(iterations=1), make_clip(frames, count, (128, 128))

@@ -18,7 +18,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tests.bench.timing import stages
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.model.tracker import Tracker
@@ -28,6 +27,7 @@ from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.data import training_clips
 from tapip3d_lite.training.loss import LossConfig, Truth
 from tapip3d_lite.training.trainer import Trainer
+from tests.bench.timing import stages
 
 
 class SavedBytes:

@@ -1,9 +1,8 @@
 """The same N2N numbers with a third of the arithmetic: the context that inference and training run by default.
 
-Paper: section 3.3, equations 4 to 6; `contexts.PairAttention` is the definition, whose weights are read here. All
-savings are exact algebra:
+`model.n2n` is the definition, whose weights are read here. All savings are exact algebra:
 
-- What depends on queries only is computed once a window (`Ready`), not for every frame and iteration.
+- What depends on queries only is computed once a window (`FoldedPair`), not for every frame and iteration.
 - With one head, scores (W_q x)(W_k y) = (W_k^T W_q x) y: the key projection moves into the static support queries,
   the query projection into the static support keys, and W_o W_v becomes one matrix or part of the static values.
   Terms that are equal for all keys vanish in the softmax; its rows sum to one, so constants move into the values.
@@ -22,14 +21,28 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tapip3d_lite.model.attention import Attention, Block, Pool
-from tapip3d_lite.model.contexts import N2N, PairAttention
+from tapip3d_lite.model.blocks import Attention, Block, Pool
+from tapip3d_lite.model.n2n import N2N, PairAttention
 from tapip3d_lite.model.neighbors import Neighbors
 
 
+class FoldedN2N(N2N):
+    """`N2N` with the same weights and numbers, folded anew in each window, so that training needs nothing else."""
+
+    def describe(self, index: int, support: Neighbors) -> FoldedPair:
+        """What does not depend on the estimates, computed once a window."""
+        tokens = super().describe(index, support)
+        with torch.autocast(tokens.device.type, enabled=False):
+            return FoldedPair.fold(self, index, _precise(tokens))
+
+    def forward(self, index: int, kept: FoldedPair, near: Neighbors) -> Tensor:
+        """The support in `kept` against `near` (B, S, N, K, ...): (B, S, N, width)."""
+        return kept.compare(near)
+
+
 @dataclass(frozen=True)
-class Ready:
-    """What one level of a window knows of its queries and weights; takes the place of `kept` in `N2N.forward`.
+class FoldedPair:
+    """What one level of a window knows of its queries and weights; `kept` of `FoldedN2N`.
 
     M = K + 1. Everything but `pair`, `offsets` and `pools` starts with (B, N) and is cut by indexing.
 
@@ -55,21 +68,48 @@ class Ready:
     values: Tensor | None = None
     mixed: Tensor | None = None
 
-    def __getitem__(self, index: tuple) -> Ready:
+    @classmethod
+    def fold(cls, context: N2N, index: int, kept: Tensor) -> FoldedPair:
+        """Fold the weights of level `index` with its support tokens (B, N, 1 + K (+ 1), D), from `N2N.describe`."""
+        pair, offsets = (
+            context.pairs[index % len(context.pairs)],
+            context.embed.offsets[index % len(context.embed.offsets)],
+        )
+        query = None
+        if context.use_features:
+            kept, query = kept[..., :-1, :], kept[..., -1, :]
+        first, second = _blocks(pair)
+        pools = FoldedPool.of(pair.pool_support, first), FoldedPool.of(pair.pool_context, second)
+        if first.attention.heads > 1:
+            return cls(pair, offsets, pools, kept, query)
+        gain, shift = first.norm_context.weight, first.norm_context.bias
+        (to_key, _), (to_value, value_bias) = _key_and_value(first.attention)
+        out = first.attention.to_out
+        looks = first.attention.to_q(first.norm(kept)) @ to_key * gain / len(to_key) ** 0.5  # (B, N, M, D)
+        mixed = gain[:, None] * (out.weight @ to_value).T
+        constant = out(to_value @ shift + value_bias)
+        keys, values = second.attention.to_kv(second.norm_context(kept)).chunk(2, -1)
+        keys = keys / keys.shape[-1] ** 0.5
+        to_query = second.attention.to_q
+        scores = torch.cat([looks, keys @ to_query.weight], -2).transpose(-1, -2).contiguous()
+        bias = (keys @ to_query.bias).unsqueeze(-2)
+        return cls(pair, offsets, pools, kept + constant, query, scores, bias, second.attention.to_out(values), mixed)
+
+    def __getitem__(self, index: tuple) -> FoldedPair:
         return self._changed(lambda part: part[index], "mixed")
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> Ready:
+    def map(self, change: Callable[[Tensor], Tensor]) -> FoldedPair:
         """The same with other tensors."""
         pools = tuple(FoldedPool(*(change(getattr(pool, f.name)) for f in fields(pool))) for pool in self.pools)
         return replace(self._changed(change), pools=pools)
 
-    def _changed(self, change: Callable[[Tensor], Tensor], *kept: str) -> Ready:
+    def _changed(self, change: Callable[[Tensor], Tensor], *kept: str) -> FoldedPair:
         names = [f.name for f in fields(self) if f.name not in ("pair", "offsets", "pools", *kept)]
         parts = {name: getattr(self, name) for name in names}
         return replace(self, **{name: change(part) for name, part in parts.items() if part is not None})
 
     def compare(self, near: Neighbors) -> Tensor:
-        """As `N2N.forward`: neighbourhoods (B, S, N, K, ...) to (B, S, N, width)."""
+        """Neighbourhoods (B, S, N, K, ...) to (B, S, N, width)."""
         # Tracks before frames: then each track's static matrix meets all its frames in one product.
         offsets = self.offsets(near.offsets.transpose(1, 2))
         tokens = _precise(offsets + near.features.transpose(1, 2)).contiguous()  # (B, N, S, K, D)
@@ -100,43 +140,6 @@ class Ready:
         one = support + first.attention(first.norm(support), first.norm_context(tokens))
         two = tokens + second.attention(second.norm(tokens), second.norm_context(support))
         return _precise(one).flatten(0, 2), _precise(two).flatten(0, 2)
-
-
-def get_ready(context: N2N, kept: list[Tensor]) -> list[Ready]:
-    """Compute once a window what does not depend on the estimates.
-
-    Args:
-        context: the weights; folded anew each window, so that training needs nothing else.
-        kept: L times (B, N, 1 + K (+ 1), D), from `N2N.describe`.
-
-    Returns:
-        L values to be given to `context` in place of `kept`.
-    """
-    with torch.autocast(kept[0].device.type, enabled=False):
-        return [_ready(context, i, _precise(x)) for i, x in enumerate(kept)]
-
-
-def _ready(context: N2N, index: int, kept: Tensor) -> Ready:
-    pair, offsets = context.pairs[index % len(context.pairs)], context.embed.offsets[index % len(context.embed.offsets)]
-    query = None
-    if context.use_features:
-        kept, query = kept[..., :-1, :], kept[..., -1, :]
-    first, second = _blocks(pair)
-    pools = FoldedPool.of(pair.pool_support, first), FoldedPool.of(pair.pool_context, second)
-    if first.attention.heads > 1:
-        return Ready(pair, offsets, pools, kept, query)
-    gain, shift = first.norm_context.weight, first.norm_context.bias
-    (to_key, _), (to_value, value_bias) = _key_and_value(first.attention)
-    out = first.attention.to_out
-    looks = first.attention.to_q(first.norm(kept)) @ to_key * gain / len(to_key) ** 0.5  # (B, N, M, D)
-    mixed = gain[:, None] * (out.weight @ to_value).T
-    constant = out(to_value @ shift + value_bias)
-    keys, values = second.attention.to_kv(second.norm_context(kept)).chunk(2, -1)
-    keys = keys / keys.shape[-1] ** 0.5
-    to_query = second.attention.to_q
-    scores = torch.cat([looks, keys @ to_query.weight], -2).transpose(-1, -2).contiguous()
-    bias = (keys @ to_query.bias).unsqueeze(-2)
-    return Ready(pair, offsets, pools, kept + constant, query, scores, bias, second.attention.to_out(values), mixed)
 
 
 @dataclass(frozen=True)
@@ -195,7 +198,7 @@ def _key_and_value(attention: Attention) -> tuple[tuple[Tensor, Tensor | None], 
 def _normalised(x: Tensor, eps: float, other: float) -> tuple[Tensor, Tensor]:
     """LayerNorm without gain, and the factor (..., 1) that turns it into the one with another eps."""
     if torch.is_grad_enabled():  # the statistics of native_layer_norm carry no gradient
-        variance = (x - x.mean(-1, keepdim=True)).square().mean(-1, keepdim=True)  # 4 times sooner than x.var
+        variance = (x - x.mean(-1, keepdim=True)).square().mean(-1, keepdim=True)  # 4 times faster than x.var
         return F.layer_norm(x, x.shape[-1:], eps=eps), ((variance + eps) / (variance + other)).sqrt()
     normed, _, inverse = torch.native_layer_norm(x, x.shape[-1:], None, None, eps)
     return normed, (1 + inverse.square() * (other - eps)).rsqrt()

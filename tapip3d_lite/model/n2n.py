@@ -1,21 +1,26 @@
 """What a point makes of its surroundings: neighbourhood-to-neighbourhood (N2N) attention.
 
-Paper: section 3.3, equations 3 to 6. The query's neighbourhood in its own frame (support, K + 1 tokens with the query
-itself first) and the estimate's neighbourhood in frame t (context, K tokens) attend to each other in both directions,
-then each bag is pooled by a learned token, and the two results are added.
+    token_j   = Linear(LN(f_j)) + MLP(fourier(o_j))                       of every cell j of a neighbourhood
+    support'  = block(support; context)      context' = block(context; support)
+    N2N       = pool(support') + pool(context')
+
+Paper: section 3.2 describes it in words, without a numbered equation. The query's neighbourhood in its own frame
+(support) and the estimate's neighbourhood in frame t (context, K tokens) attend to each other in both directions, then
+each bag is pooled by a learned token. The paper's support has K tokens; the released code's has K + 1, the query itself
+first, and so has ours.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.model.attention import Block, Pool
+from tapip3d_lite.model.blocks import Block, OffsetEmbedding, Pool
 from tapip3d_lite.model.cloud import Level
 from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.fourier import OffsetEmbedding
 from tapip3d_lite.model.neighbors import Neighbors
 
 
@@ -34,7 +39,7 @@ class Context(nn.Module):
         """Transform level `index` of the (normalised) cloud before neighbourhoods are collected from it."""
         return level
 
-    def describe(self, index: int, support: Neighbors) -> Tensor:
+    def describe(self, index: int, support: Neighbors) -> Any:
         """What to remember of the queries.
 
         Args:
@@ -43,11 +48,12 @@ class Context(nn.Module):
                 neighbourhood in its own frame; features are the encoder's, coordinates normalised.
 
         Returns:
-            (B, N, ...), given to `forward` as `kept`.
+            A tensor (B, N, ...), given to `forward` as `kept`; or an object of tensors that is cut by `[:, rows]` as
+            a tensor is, and changed by `map(function of a tensor)`.
         """
         return support.features
 
-    def forward(self, index: int, kept: Tensor, near: Neighbors) -> Tensor:
+    def forward(self, index: int, kept: Any, near: Neighbors) -> Tensor:
         """Compare what is around the current estimate with what was around the query.
 
         Args:
@@ -70,7 +76,8 @@ class CellEmbedding(nn.Module):
         self.norm = nn.LayerNorm(config.feature_dim)
         self.project = nn.Identity() if same else nn.Linear(config.feature_dim, config.token_dim)
         copies = 1 if config.share_levels else config.levels
-        self.offsets = nn.ModuleList(OffsetEmbedding(config) for _ in range(copies))
+        sizes = config.offset_layers, config.offset_dim, config.token_dim
+        self.offsets = nn.ModuleList(OffsetEmbedding(*sizes) for _ in range(copies))
 
     def features(self, features: Tensor) -> Tensor:
         """(..., C) to (..., D)."""
@@ -82,7 +89,7 @@ class CellEmbedding(nn.Module):
 
 
 class PairAttention(nn.Module):
-    """Two bags of tokens to one vector: cross-attention both ways, pooling of each, sum (equations 4 to 6)."""
+    """Two bags of tokens to one vector: cross-attention both ways, pooling of each, sum."""
 
     def __init__(self, config: TrackerConfig) -> None:
         super().__init__()
@@ -113,47 +120,18 @@ class N2N(Context):
         """Embed each cell once, not once for every neighbourhood that contains it."""
         return replace(level, features=self.embed.features(level.features))
 
-    def describe(self, index: int, support: Neighbors) -> Tensor:
+    def describe(self, index: int, support: Neighbors) -> Any:
         """Support tokens (B, N, 1 + K, D); with `use_features` the query's embedded feature follows as one more row."""
         features = self.embed.features(support.features)
         tokens = features + self.embed.offset(index, support.offsets)
         return torch.cat([tokens, features[..., :1, :]], -2) if self.use_features else tokens
 
-    def forward(self, index: int, kept: Tensor, near: Neighbors) -> Tensor:
-        """See `Context.forward`; `kept` may also be what `fast.get_ready` made of it, for the same result sooner."""
-        if not isinstance(kept, Tensor):
-            return kept.compare(near)
+    def forward(self, index: int, kept: Any, near: Neighbors) -> Tensor:
+        """Support tokens `kept` against the tokens of `near`, for every frame and track: (B, S, N, width)."""
         context = near.features + self.embed.offset(index, near.offsets)  # (B, S, N, K, D)
         lead = context.shape[:3]
-        kept = kept[:, None].expand(*lead, *kept.shape[2:])
+        kept = kept[:, None].expand(*lead, *kept.shape[2:])  # (B, N, K + 1, D) -> (B, S, N, K + 1, D)
         support = kept[..., : kept.shape[-2] - self.use_features, :]
-        out = self.pairs[index % len(self.pairs)](support.flatten(0, 2), context.flatten(0, 2)).unflatten(0, lead)
+        pair = self.pairs[index % len(self.pairs)]
+        out = pair(support.flatten(0, 2), context.flatten(0, 2)).unflatten(0, lead)  # (P, D) -> (B, S, N, D)
         return torch.cat([out, kept[..., -1, :]], -1) if self.use_features else out
-
-
-class P2N(Context):
-    """Point to neighbourhood (the paper's "without N2N"): the query alone looks at the context, in one direction."""
-
-    def __init__(self, config: TrackerConfig) -> None:
-        super().__init__()
-        self.embed = CellEmbedding(config)
-        copies = 1 if config.share_levels else config.levels
-        sizes = config.token_dim, config.context_heads, config.context_head_dim
-        self.looks = nn.ModuleList(Block(*sizes, config.context_mlp_ratio, cross=True) for _ in range(copies))
-        self.width = config.token_dim
-
-    def prepare(self, index: int, level: Level) -> Level:
-        """As for `N2N`."""
-        return replace(level, features=self.embed.features(level.features))
-
-    def describe(self, index: int, support: Neighbors) -> Tensor:
-        """The query's token (B, N, D), without its neighbourhood."""
-        own = self.embed.features(support.features[..., 0, :])
-        return own + self.embed.offset(index, support.offsets[..., 0, :])
-
-    def forward(self, index: int, kept: Tensor, near: Neighbors) -> Tensor:
-        """See `Context.forward`."""
-        context = near.features + self.embed.offset(index, near.offsets)  # (B, S, N, K, D)
-        query = kept[:, None, :, None].expand(*context.shape[:3], 1, -1)
-        look = self.looks[index % len(self.looks)]
-        return look(query.flatten(0, 2), context.flatten(0, 2)).squeeze(-2).unflatten(0, context.shape[:3])

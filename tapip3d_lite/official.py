@@ -6,40 +6,44 @@ The mapping is strict: what is not understood raises, since a silently ignored o
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from tapip3d_lite.checkpoint_reader import read_checkpoint
+from tapip3d_lite.model.blocks import time_embedding
 from tapip3d_lite.model.config import TrackerConfig
-from tapip3d_lite.model.fourier import time_embedding
 from tapip3d_lite.model.tracker import Tracker
 
-_PLAIN = {  # their key -> our field, and their default
-    "seq_len": ("window", None),
+# Their key -> our field, and the released value, for a stored configuration names only what differs from the code's
+# defaults. None: it must be there, since no parameter's shape would show a wrong guess.
+_PLAIN = {
+    "seq_len": ("window", 16),
     "corr_levels": ("levels", 4),
     "norm_mode": ("norm_mode", "none"),
     "norm_scale": ("norm_scale", 1.0),
     "use_uv_input": ("use_uv", False),
     "center_rgb": ("center_rgb", False),
-    "encoder.output_dim": ("feature_dim", None),
+    "encoder.output_dim": ("feature_dim", 128),
     "encoder.stride": ("stride", None),
     "corr_feature.k_neighbors": ("neighbors", None),
-    "corr_feature.posenc_mlp_dim": ("offset_dim", None),
-    "corr_feature.posenc_mlp_layers": ("offset_layers", None),
-    "corr_feature.transformer_dim": ("token_dim", None),
+    "corr_feature.posenc_mlp_dim": ("offset_dim", 128),
+    "corr_feature.posenc_mlp_layers": ("offset_layers", 3),
+    "corr_feature.transformer_dim": ("token_dim", 128),
     "corr_feature.transformer_num_heads": ("context_heads", None),
-    "corr_feature.transformer_head_dim": ("context_head_dim", None),
-    "corr_feature.transformer_mlp_ratio": ("context_mlp_ratio", None),
+    "corr_feature.transformer_head_dim": ("context_head_dim", 128),
+    "corr_feature.transformer_mlp_ratio": ("context_mlp_ratio", 1.0),
     "corr_feature.use_features": ("use_features", False),
     "corr_feature.share_weights_across_levels": ("share_levels", False),
-    "point_updater.space_depth": ("space_depth", None),
-    "point_updater.time_depth": ("time_depth", None),
-    "point_updater.hidden_size": ("hidden", None),
-    "point_updater.num_heads": ("heads", None),
-    "point_updater.output_dim": ("outputs", None),
-    "point_updater.mlp_ratio": ("mlp_ratio", None),
-    "point_updater.num_virtual_tracks": ("virtual_tracks", None),
+    "point_updater.space_depth": ("space_depth", 3),
+    "point_updater.time_depth": ("time_depth", 3),
+    "point_updater.hidden_size": ("hidden", 384),
+    "point_updater.num_heads": ("heads", 8),
+    "point_updater.output_dim": ("outputs", 5),
+    "point_updater.mlp_ratio": ("mlp_ratio", 4.0),
+    "point_updater.num_virtual_tracks": ("virtual_tracks", 64),
     "point_updater.linear_layer_for_vis_conf": ("separate_vis_head", False),
 }
 _REQUIRED = {  # options that we have in one value only
@@ -65,13 +69,30 @@ _IGNORED = {  # without meaning for inference, or restated by other options
 }
 
 
-def from_official_state(cfg: Mapping[str, Any], state: Mapping[str, Tensor]) -> Tracker:
+def load_official(path: str | Path, fast: bool = True) -> Tracker:
+    """Read the authors' checkpoint file {"cfg", "weight", …}; no code from the file can run.
+
+    Args:
+        path: the .pth file, saved from a CPU or a GPU.
+        fast: use the fast forms of its parts, see `Tracker`.
+
+    Returns:
+        The tracker on the CPU, in evaluation mode.
+
+    Raises:
+        ValueError: not such a file, a refused global in its pickle, or a model that we do not know.
+    """
+    return from_official_state(*read_checkpoint(path), fast=fast)
+
+
+def from_official_state(cfg: Mapping[str, Any], state: Mapping[str, Tensor], fast: bool = True) -> Tracker:
     """Build the tracker that a released checkpoint describes.
 
     Args:
         cfg: the checkpoint's configuration as plain mappings: `model`, and `train_dataset.resolution` unless
             `model.image_size` is given.
         state: parameters under the authors' names.
+        fast: use the fast forms of its parts, see `Tracker`.
 
     Returns:
         The tracker in evaluation mode; its space is `"world"`, and `"camera"` serves as well.
@@ -79,7 +100,7 @@ def from_official_state(cfg: Mapping[str, Any], state: Mapping[str, Tensor]) -> 
     Raises:
         ValueError: options or parameters that are unknown, missing or of another shape, by name.
     """
-    tracker = Tracker(official_config(cfg))
+    tracker = Tracker(official_config(cfg), fast)
     state = dict(state)
     _check_time(tracker, state.pop("time_emb", None))
     names = parameter_names(tracker)
@@ -111,9 +132,8 @@ def official_config(cfg: Mapping[str, Any]) -> TrackerConfig:
         ours[field] = value
     if flat:
         raise ValueError(f"cfg.model: unknown options {', '.join(sorted(flat))}; they might change the numbers")
-    size = cfg["model"].get("image_size") or cfg.get("train_dataset", {}).get("resolution")
-    if size is None:
-        raise ValueError("cfg: the image size is missing; expected train_dataset.resolution = (H, W)")
+    size = cfg["model"].get("image_size") or cfg.get("train_dataset", {}).get("resolution") or (384, 512)
+    # The released updater's heads are 48 wide, whatever its width.
     return TrackerConfig(image_size=tuple(size), space="world", exclude_invalid=False, head_dim=48, **ours)
 
 

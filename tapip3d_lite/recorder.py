@@ -17,9 +17,10 @@ from types import TracebackType
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.model.contexts import N2N, P2N
+from tapip3d_lite.model.n2n import N2N
 from tapip3d_lite.model.neighbors import Neighbors
-from tapip3d_lite.model.scene import Window, to_world
+from tapip3d_lite.model.windows import Window, to_world
+from tapip3d_lite.variants.p2n import P2N
 
 
 @dataclass
@@ -98,7 +99,11 @@ class Recorder:
 
     def _watch(self, window: Window, coords: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
         tokens: list[Tensor] = []
-        handle = self.tracker.updater.register_forward_pre_hook(lambda _, inputs: tokens.append(inputs[0]))
+
+        def keep(_: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+            tokens.append(inputs[0])
+
+        handle = self.tracker.updater.register_forward_pre_hook(keep)
         try:
             after = self._update(window, coords, logits)
         finally:
@@ -121,12 +126,12 @@ class Recorder:
         scene, level = window.scene, window.levels[index]
         uv = scene.space.to_pixels(window.norm.restore(coords), scene.frames.intrinsics, scene.frames.extrinsics)
         near = _first(self.tracker.neighborhood(level, coords, level.cells(uv, scene.frames.size)))
-        support, kept = _first(window.support[index].pick(chosen)), window.kept[index][0, chosen]
+        support = _first(window.support[index].pick(chosen))
         context = self.tracker.context
-        if isinstance(context, N2N):
-            found = _look_at_n2n(context, index, kept, near)
+        if isinstance(context, N2N):  # its clear form, whichever one the tracker computes with
+            found = _look_at_n2n(context, index, N2N.describe(context, index, support), near)
         elif isinstance(context, P2N):
-            found = _look_at_p2n(context, index, kept, near)
+            found = _look_at_p2n(context, index, context.describe(index, support), near)
         else:
             found = {}
         return LevelRecord(near, support, **found)

@@ -1,6 +1,10 @@
 """Tracking one clip as a user wants it: any image size, both directions in time, helped by a grid of other points.
 
-Paper: section 4 (protocol): a grid of support queries, depth's region of interest, a second pass backward in time.
+    forward pass  from t = 0 on;  backward pass on the reversed clip, for the frames before each query
+    visible       sigmoid(v) >= threshold
+
+Paper: section 4 (protocol: a grid of support queries, a second pass backward in time); the region of interest of depth
+is the released code's.
 """
 
 from __future__ import annotations
@@ -71,10 +75,11 @@ def track(
     backward = bidirectional and bool((queries[:, 0] > 0).any())
     ways = _ways(tracker, clip)
     with _bar(progress, tracker, len(clip), iterations, 1 + backward) as bar:
-        xyz, logits = _one_way(tracker, ways[0], queries, grids[0], options, bar)
+        options["watch"] = lambda _: bar.update()
+        xyz, logits = _one_way(ways[0], queries, grids[0], options)
         if backward:
             flipped = [_flip_time(rows, len(clip)) for rows in (queries, grids[1])]
-            other = _one_way(tracker, ways[1], *flipped, options, bar)
+            other = _one_way(ways[1], *flipped, options)
             before = np.arange(len(clip))[:, None] < queries[:, 0]
             xyz = np.where(before[..., None], other[0][::-1], xyz)
             logits = np.where(before, other[1][::-1], logits)
@@ -85,7 +90,8 @@ def track(
 def _ways(tracker: nn.Module, clip: Clip) -> list[Callable[..., tuple[np.ndarray, np.ndarray]]]:
     """Functions of (rows, **options) that track forward and backward in time."""
     config = tracker.config
-    if len(clip) * config.feature_dim * math.prod(config.grid_sizes[0]) > _KEPT:
+    cells = math.prod(side // config.stride for side in config.image_size)
+    if len(clip) * config.feature_dim * cells > _KEPT:
         return [partial(_streamed, tracker, clip, range(len(clip))[::step]) for step in (1, -1)]
     frames = frames_from_clip(clip, device=next(tracker.parameters()).device)
     features = tracker.encoder(frames.rgb)
@@ -110,14 +116,8 @@ def _streamed(
     return tracks.xyz, tracks.visible_logits
 
 
-def _one_way(
-    tracker: nn.Module, way: Callable, queries: np.ndarray, grid: np.ndarray, options: dict, bar: Any
-) -> tuple[np.ndarray, np.ndarray]:
-    handle = tracker.updater.register_forward_hook(lambda *_: bar.update())
-    try:
-        xyz, logits = way(np.concatenate([queries, grid]).astype(np.float32), **options)
-    finally:
-        handle.remove()
+def _one_way(way: Callable, queries: np.ndarray, grid: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray]:
+    xyz, logits = way(np.concatenate([queries, grid]).astype(np.float32), **options)
     return xyz[:, : len(queries)], logits[:, : len(queries)]
 
 

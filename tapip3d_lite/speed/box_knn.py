@@ -1,13 +1,15 @@
-"""Exact nearest neighbours in organised point maps: the same indices as `neighbors.knn`, many times sooner on a CPU.
+"""Exact nearest neighbours in organised point maps: the same indices as `model.neighbors.knn`, many times faster.
 
-Paper: section 3.3 (k-NN in 3D), a large part of the time there. Cells that touch in a map mostly lie close in 3D, so
-2 x 4 cells make a block and 4 x 4 blocks a node, each with its bounding box. For each point the nearest nodes are
-opened, of their blocks the nearest, and the K nearest of their cells are sorted.
+k-NN in 3D is a large part of the paper's time. On a CPU, cells that touch in a map mostly lie close in 3D, so 2 x 4
+cells make a block and 4 x 4 blocks a node, each with its bounding box. For each point the nearest nodes are opened, of
+their blocks the nearest, and the K nearest of their cells are sorted.
 
 Proof: no cell of a box is nearer than the box. Where the K-th distance found is below the nearest box that was left
 closed, the answer is exact; the other points are asked again with more boxes open, in the end all. This holds in
 floating point too: subtracting, squaring and adding round monotonically, so a box's computed distance never exceeds
 that of a cell in it, taken in the same order. No projection is needed, so it works in every space.
+
+On a GPU all distances are computed, but only the cells of the K nearest runs of 8 cells are sorted.
 """
 
 from __future__ import annotations
@@ -18,12 +20,54 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from tapip3d_lite.model.cloud import Level
+from tapip3d_lite.model.neighbors import INFINITE, KNearest, knn, nearest_first, squared_distances
+
 BLOCK, NODE = (2, 4), (8, 16)  # rows and columns of cells
 _LARGE = 128 * BLOCK[0] * BLOCK[1]  # cells of a map from which on its blocks are grouped to nodes
-_SHORT = 256  # numbers in a row up to which sorting all is quicker than finding the smallest
+_SHORT = 256  # numbers in a row up to which sorting all is faster than finding the smallest
 _BUDGET = 2**18  # distances at once: a MiB, so that temporaries stay in the cache
 _WIDER = (1, 2, 6)  # times as many boxes are opened for points whose proof failed; then all
-INFINITE = int(torch.tensor(torch.inf).view(torch.int32))  # bits of non-negative floats order like the floats
+_FEW = 2**16  # distances that are computed faster than boxes are searched
+_RUN = 8  # neighbouring cells that are looked at together on a GPU
+
+
+class BoxKNearest(KNearest):
+    """The K cells nearest in 3D, as `KNearest` finds them."""
+
+    def search(self, level: Level, queries: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:
+        """Indices (F, N, K), as those of `KNearest.search`; boxes are built once for each window and level."""
+        if queries.is_cuda:
+            return run_knn(queries, points, self.count, valid)
+        if queries.shape[:2].numel() * points.shape[1] <= _FEW:
+            return knn(queries, points, self.count, valid)
+        if "boxes" not in level.memory:
+            mask = level.valid.flatten(0, 1) if self.exclude_invalid else None
+            level.memory["boxes"] = BlockTree.build(level.points.flatten(0, 1), mask)
+        boxes = level.memory["boxes"]
+        return knn(queries, points, self.count, valid) if boxes is None else boxes.knn(queries, self.count)
+
+
+def run_knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = None) -> Tensor:
+    """As `model.neighbors.knn`, without waiting for a GPU, and with fewer numbers to sort."""
+    total = points.shape[1]
+    if total % _RUN or total <= 2 * _RUN * count:
+        return knn(queries, points, count, valid)
+    step = max(1, 2**28 // (len(points) * total))
+    parts = [_nearest_of_runs(part, points.float(), count, valid) for part in queries.float().split(step, 1)]
+    return torch.cat(parts, 1) if parts else knn(queries, points, count, valid)
+
+
+def _nearest_of_runs(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) -> Tensor:
+    distance = squared_distances(queries, points)  # (F, N, P)
+    if valid is not None:
+        distance.masked_fill_(~valid[:, None], torch.inf)
+    indices = torch.arange(distance.shape[-1], device=distance.device)
+    # The K nearest lie in the K runs of cells whose nearest ones are nearest, ties included: fewer are sorted.
+    nearest = distance.unflatten(-1, (-1, _RUN)).amin(-1)  # (F, N, P / 8)
+    runs = nearest_first(nearest, indices[: nearest.shape[-1]], count, masked=False)  # (F, N, K)
+    indices = (runs.unsqueeze(-1) * _RUN + indices[:_RUN]).flatten(-2)  # (F, N, 8 K)
+    return nearest_first(distance.gather(-1, indices), indices, count, valid is not None)
 
 
 @dataclass(frozen=True)
@@ -67,7 +111,7 @@ class BlockTree:
 
     @classmethod
     def build(cls, points: Tensor, valid: Tensor | None = None) -> BlockTree | None:
-        """Enclose the cells of maps (F, h, w, 3) that are valid (F, h, w); None if `neighbors.knn` must do."""
+        """Enclose the cells of maps (F, h, w, 3) that are valid (F, h, w); None if `model.neighbors.knn` must do."""
         if points.device.type != "cpu" or points.dtype != torch.float32 or bool(points.isnan().any()):
             return None
         frames, height, width = points.shape[:3]
@@ -95,7 +139,7 @@ class BlockTree:
             count: K, at most h * w.
 
         Returns:
-            (F, N, K) int64, as `neighbors.knn` gives for the flattened maps.
+            (F, N, K) int64, as `model.neighbors.knn` gives for the flattened maps.
 
         Raises:
             ValueError: K exceeds the cells of a map.
