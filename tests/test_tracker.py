@@ -1,12 +1,16 @@
 """The tracker as a whole: windows, batches, spaces, training steps, and what a user calls."""
 
+import contextlib
 import copy
 import dataclasses
+import io
+import re
 
 import numpy as np
 import pytest
 import torch
 
+import tapip3d_lite as t3d
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert, transform
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
@@ -15,7 +19,7 @@ from tapip3d_lite.model.neighbors import KNearest
 from tapip3d_lite.model.spaces import World
 from tapip3d_lite.model.tracker import Tracker, TrackerConfig
 from tapip3d_lite.model.windows import State, window_ends
-from tapip3d_lite.official import from_official_state
+from tapip3d_lite.official import from_official_state, parameter_names
 from tests import parity
 from tests.test_model import SMALL
 
@@ -319,16 +323,81 @@ def test_inputs_that_cannot_work(golden):
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ({"seq_len": None}, "seq_len: missing"),
+        ({"corr_feature": {"name": "knn_corr_4d"}}, r"corr_feature\.k_neighbors: missing"),
         ({"colour": 1}, "unknown options colour"),
         ({"relative": True}, "relative: only False"),
-        ({"image_size": None}, "image size is missing"),
+        ({"seq_len": 10}, "time_emb"),
     ],
 )
 def test_official_options_are_strict(golden, option, message):
     model = {k: v for k, v in (golden.config["model"] | option).items() if v is not None}
     with pytest.raises(ValueError, match=message):
         from_official_state({"model": model}, {})
+
+
+# Exactly what the released checkpoint stores: options that have a default in the released code are not in it.
+RELEASED = {
+    "name": "point_tracker_3d",
+    "seq_len": 16,
+    "norm_mode": "isotropic",
+    "corr_levels": 4,
+    "use_local_pos_input": False,
+    "find_knn_in_normalized_space": False,
+    "use_uv_input": True,
+    "center_rgb": True,
+    "encoder": {"name": "cotracker_cnn", "output_dim": 128, "stride": 4, "pretrained": True, "freeze_mode": "none"},
+    "corr_feature": {
+        "name": "knn_corr_4d",
+        "k_neighbors": 32,
+        "posenc_mlp_layers": 3,
+        "posenc_mlp_dim": 128,
+        "transformer_dim": 128,
+        "transformer_num_heads": 1,
+        "transformer_head_dim": 128,
+        "transformer_mlp_ratio": 1.0,
+        "better_depth_downsample": True,
+    },
+    "point_updater": {
+        "name": "efficient_updateformer",
+        "space_depth": 3,
+        "time_depth": 3,
+        "input_dim": 777,
+        "hidden_size": 384,
+        "output_dim": 5,
+        "mlp_ratio": 4.0,
+        "num_virtual_tracks": 64,
+        "add_space_attn": True,
+        "linear_layer_for_vis_conf": True,
+    },
+}
+
+
+@pytest.mark.parametrize("size", [None, (256, 320)])
+def test_the_released_configuration_loads(size):
+    torch.manual_seed(0)
+    ours = Tracker(TrackerConfig.preset("paper", center_rgb=True, image_size=size or (384, 512)))
+    own = ours.state_dict()
+    state = {theirs: own[name] for theirs, name in parameter_names(ours).items()}
+    state["point_updater.virual_tracks"] = state["point_updater.virual_tracks"].transpose(1, 2)
+    cfg = {"model": RELEASED} | ({"train_dataset": {"resolution": list(size)}} if size else {})
+    loaded = from_official_state(cfg, state | {"time_emb": ours.time[None]})
+    assert loaded.config == ours.config and loaded.config.heads == 8 and loaded.config.head_dim == 48
+    assert all(torch.equal(x, own[name]) for name, x in loaded.state_dict().items())
+    assert sum(p.numel() for p in loaded.parameters()) == pytest.approx(25.7e6, rel=0.01)
+
+
+def test_a_bar_that_is_redrawn_at_every_update(monkeypatch):
+    """What `tqdm.update` returns when it draws must not become the updater's result."""
+    monkeypatch.setenv("TQDM_MININTERVAL", "0")
+    torch.manual_seed(0)
+    tracker = Tracker(TrackerConfig.preset("lite", **SMALL)).eval()
+    clip = t3d.simulate_clip(seed=0, frames=6, size=SMALL["image_size"], tracks=8)
+    shown = io.StringIO()
+    with contextlib.redirect_stderr(shown):
+        watched = tracker.track(clip, progress=True)
+    np.testing.assert_array_equal(watched.xyz, tracker.track(clip).xyz)
+    total = int(re.findall(r"(\d+)/(\d+)", shown.getvalue())[-1][1])
+    assert f"{total}/{total}" in shown.getvalue() and total > 2
 
 
 def test_official_parameters_are_strict(golden):
