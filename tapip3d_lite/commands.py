@@ -38,7 +38,7 @@ def curves(
 ) -> None:
     """Draw the learning curves of trainings, finished or not: matching, loss, accuracy, held-out scores."""
     from tapip3d_lite.training.journal import read_log
-    from lessons.n06_live import learning_curves
+    from tapip3d_lite.figures.curves import learning_curves
 
     logs = [(folder.stem if folder.is_file() else folder.resolve().name, read_log(folder)) for folder in folders]
     t3d.figures.save_png(learning_curves(logs, by=by), out)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tapip3d_lite.geometry import project, unproject
 from lessons.checker import Exercise, Mistake
+from tapip3d_lite.geometry import project, unproject
 
 Array = np.ndarray
 

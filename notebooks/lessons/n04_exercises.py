@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tapip3d_lite.model.fourier import DEGREES
 from lessons.checker import Exercise, Mistake
+from tapip3d_lite.model.fourier import DEGREES
 
 Array = np.ndarray
 Weights = tuple[Array, Array, Array, Array]  # W_q, W_k, W_v (E, D) and W_o (D, E), used as x @ W.T

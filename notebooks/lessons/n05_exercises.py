@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lessons.n04_exercises import fourier_features, softmax
 from lessons.checker import Exercise, Mistake
+from lessons.n04_exercises import fourier_features, softmax
 
 Array = np.ndarray
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tapip3d_lite.geometry import transform
-from lessons.n06_chain import BACKWARD
 from lessons.checker import Exercise, Mistake
+from lessons.n06_chain import BACKWARD
+from tapip3d_lite.geometry import transform
 
 Array = np.ndarray
 

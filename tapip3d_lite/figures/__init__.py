@@ -15,9 +15,17 @@ from IPython import get_ipython
 from IPython.display import display
 from matplotlib.figure import Figure
 
-from tapip3d_lite.files import atomic_path
-from tapip3d_lite.figures.flat import contact_sheet, depth_map, frame_with_tracks, overview, scores_bar, track_colors, tracks_over_time
+from tapip3d_lite.figures.flat import (
+    contact_sheet,
+    depth_map,
+    frame_with_tracks,
+    overview,
+    scores_bar,
+    track_colors,
+    tracks_over_time,
+)
 from tapip3d_lite.figures.scene_3d import tracks_3d, tracks_3d_static
+from tapip3d_lite.files import atomic_path
 
 __all__ = [
     "contact_sheet",

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from lessons.checker import Exercise, Mistake, check, score_guess
+from lessons.n01 import random_extrinsics, random_intrinsics
+from lessons.widgets import explore
 from tapip3d_lite.geometry import invert, transform, unproject
-from lessons.checker import Exercise, Mistake
-from lessons.n01_exercises import random_extrinsics, random_intrinsics
+
+__all__ = ["EXERCISES", "check", "explore", "score_guess"]
 
 Array = np.ndarray
 

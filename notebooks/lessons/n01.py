@@ -6,8 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from lessons.checker import Exercise, Mistake, check, score_guess
+from lessons.widgets import explore
 from tapip3d_lite.geometry import invert, resize_intrinsics, transform, unproject
-from lessons.checker import Exercise, Mistake
+
+__all__ = ["EXERCISES", "check", "explore", "random_extrinsics", "random_intrinsics", "score_guess"]
 
 Array = np.ndarray
 
