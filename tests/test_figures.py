@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import tapip3d_lite as t3d
-from tapip3d_lite.figures import png_bytes
 from lessons.widgets import explore
+from tapip3d_lite.figures import png_bytes
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Exercises of notebook 00: queries from pixels, where a camera stands, visibility by depth, hits within a ball."""
+"""Lesson 00, its exercises: queries from pixels, where a camera stands, visibility by depth, hits within a ball."""
 
 from __future__ import annotations
 

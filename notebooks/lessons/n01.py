@@ -1,4 +1,4 @@
-"""Exercises of notebook 01: from RGB-D to point maps and feature clouds."""
+"""Lesson 01, its exercises: from RGB-D to point maps and feature clouds."""
 
 from __future__ import annotations
 

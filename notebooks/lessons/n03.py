@@ -87,11 +87,11 @@ class Around:
         return cls(clip, frame, cells, xyz[0], uv[0], bool(clip.tracks.visible[frame, track]), found, right)
 
     def points(self, kind: str) -> np.ndarray:
-        """(K, 3), camera frame."""
+        """The neighbours' points (K, 3), camera frame."""
         return transform(self.cells.points.reshape(-1, 3)[self.found[kind]], self.clip.extrinsics[self.frame])
 
     def pixels(self, kind: str) -> np.ndarray:
-        """(K, 2)."""
+        """The neighbours' pixels (K, 2)."""
         return self.cells.uv.reshape(-1, 2)[self.found[kind]]
 
     def surroundings(self, box: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +119,7 @@ def two_neighborhoods(
 
     Args:
         clip: with true tracks.
-        objects: (T, H, W), see `simulate.object_maps`.
+        objects: (T, H, W), from `simulate.object_maps`.
         track: whose true position in the frame is the query; hollow where it is hidden.
         frame: frame index.
         neighbors: K.

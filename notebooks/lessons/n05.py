@@ -118,7 +118,7 @@ class Film:
         return np.linalg.norm(path[:, : len(truth)] - truth, axis=-1)
 
     def path(self, window: int, track: int) -> np.ndarray:
-        """(M + 1, S, 3); `ValueError` where the window does not contain the track."""
+        """Estimates (M + 1, S, 3) of one track; `ValueError` where the window does not contain the track."""
         if not 0 <= window < len(self.starts) or track not in self.columns[window]:
             raise ValueError(f"window: expected one with track {track}, got {window}; take a later one")
         return self.xyz[window][:, :, list(self.columns[window]).index(track)]
@@ -219,7 +219,7 @@ def without(tracker: nn.Module, part: str) -> Iterator[nn.Module]:
 
     Args:
         tracker: with the updater `transformer`.
-        part: `"motion"`: every token says that the point stands still; `"virtual tracks"`: no track hears of others.
+        part: `"motion"`: every token says that the point stands still; `"virtual tracks"`: points read nothing from them.
 
     Raises:
         ValueError: no such part.

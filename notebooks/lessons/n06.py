@@ -100,7 +100,7 @@ class LivePlot:
         self.draw()
 
     def press(self) -> None:
-        """What the button does."""
+        """Stop the training after its present step, as the button does."""
         self._pressed = True
         self.button.disabled = True
 
