@@ -102,6 +102,17 @@ def test_imports_stand_together_and_name_no_lesson_but_its_own(path):
     assert lessons == {f"lessons.n{path.stem[:2]}"}
 
 
+def test_lessons_are_small_and_use_public_names():
+    for path in sorted((FOLDER / "lessons").glob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= 300, path.name
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ImportFrom):
+                assert node.module.split(".")[0] != "tests", path.name
+                names = [*node.module.split("."), *(alias.name for alias in node.names)]
+                assert not [name for name in names if name.startswith("_") and not name.startswith("__")], path.name
+
+
 def test_a_kernel_finds_the_lessons_wherever_lab_is_started(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT))
     import run as command
