@@ -2,12 +2,12 @@
 """Set everything up and run it, with nothing but Python 3.10 or newer: `python3 run.py lab`.
 
 Only the standard library is used here, since this file runs before anything is installed. The environment lives in
-`.venv` beside this file and is brought up to date whenever `requirements.txt` or `pyproject.toml` changes.
+`.venv` beside this file and is brought up to date whenever `requirements.txt` or `pyproject.toml` changes. Commands run
+in this file's folder, from wherever it is called: relative paths in their arguments begin here.
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import shutil
@@ -27,24 +27,40 @@ COMMANDS = {
     "other arguments go to pytest, and then notebooks are left out",
     "demo": "track a sample clip, write a 3D page and a picture; arguments as for `python -m tapip3d_lite demo`",
     "notebooks": "run the notebooks and store their fresh outputs; names select some, e.g. 01_lifting",
+    "teach": "write a teacher's pack: --out PACK; notebooks with blanks, the same solved, a timing plan",
+    "formulas": "write notebooks/FORMULAS.md from the code",
+    "samples": "write data_samples/ and the README's picture from their seeds",
+    "bench": "measure speed and memory against straightforward forms",
+}
+MODULES = {  # of the commands that only pass their arguments on
+    "demo": ("tapip3d_lite", "demo"),
+    "notebooks": ("tests.notebook_tools",),
+    "teach": ("lessons.teaching",),
+    "formulas": ("lessons.formulas",),
+    "samples": ("lessons.samples",),
+    "bench": ("tests.bench",),
 }
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    commands = parser.add_subparsers(dest="command", required=True, metavar="setup | lab | test | demo | notebooks")
-    for name, text in COMMANDS.items():
-        commands.add_parser(name, help=text, description=text)
-    # Everything behind the command belongs to the program it starts: JupyterLab, pytest, tapip3d_lite.
-    chosen, arguments = parser.parse_known_args()
-    if chosen.command == "setup" and arguments:
-        parser.error(f"setup takes no arguments, got {' '.join(arguments)}")
+    name, *arguments = sys.argv[1:] or [""]
+    if name in ("-h", "--help"):
+        print("\n".join([__doc__, *(f"  {command:<10} {text}" for command, text in COMMANDS.items())]))
+        return 0
+    if name not in COMMANDS or (name == "setup" and arguments):
+        wrong = (
+            "setup takes no arguments" if name in COMMANDS else f"no command {name!r}; there are {', '.join(COMMANDS)}"
+        )
+        print(f"run.py: {wrong}", file=sys.stderr)
+        return 2
     if sys.version_info < (3, 10):  # noqa: UP036 (run.py is what an older Python meets first)
         print(f"Python 3.10 or newer is needed, this is {sys.version.split()[0]}; try python3.11 run.py …")
         return 2
     try:
         setup()
-        return globals()[f"run_{chosen.command}"](*arguments)
+        if name in MODULES:
+            return _call("-m", *MODULES[name], *arguments)
+        return {"setup": run_setup, "lab": run_lab, "test": run_test}[name](*arguments)
     except subprocess.CalledProcessError as error:
         print(f"run.py: this step failed with exit code {error.returncode}: {' '.join(map(str, error.cmd))}")
         return 1
@@ -92,20 +108,15 @@ def run_test(*arguments: str) -> int:
     return unit or notebooks
 
 
-def run_demo(*arguments: str) -> int:
-    return _call("-m", "tapip3d_lite", "demo", *arguments)
-
-
-def run_notebooks(*names: str) -> int:
-    return _call("-m", "tests.notebook_tools", *names)
-
-
 def _call(*arguments: object) -> int:
-    return subprocess.run([PYTHON, *map(str, arguments)], cwd=ROOT).returncode
+    """Run Python in this folder, where it also finds the notebooks' `lessons`."""
+    places = [str(ROOT / "notebooks"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(places)}
+    return subprocess.run([PYTHON, *map(str, arguments)], cwd=ROOT, env=environment).returncode
 
 
 def _root_user() -> list[str]:
-    """JupyterLab refuses to run as root without being told; containers and CI usually are root."""
+    """JupyterLab refuses to run as root unless it is allowed to; containers and CI usually are root."""
     return ["--allow-root"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
 
 

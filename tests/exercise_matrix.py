@@ -1,13 +1,13 @@
-"""Every exercise with typical wrong answers and what its checker says: `python -m tests.exercise_matrix`, in Markdown."""
+"""Every exercise with typical wrong answers and what its checker says: `PYTHONPATH=notebooks python -m tests.exercise_matrix`, in Markdown."""
 
 import sys
 
-from lessons import EXERCISES, check
+from lessons.checker import all_exercises, check
 
 
 def rows():
     """(exercise, answer, verdict, hint), the reference first, as the checkers judge them now."""
-    for name, exercise in EXERCISES.items():
+    for name, exercise in all_exercises().items():
         yield name, "the reference", check(name, exercise.reference).status, ""
         for mistake in exercise.mistakes:
             verdict = check(name, mistake.answer)

@@ -1,9 +1,13 @@
-"""Run notebooks, store clean outputs: `python -m tests.notebook_tools [name …]`."""
+"""Run notebooks, store clean outputs: `python3 run.py notebooks [name …]`; start a JupyterLab for tests."""
 
 import argparse
+import json
+import os
 import re
+import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import nbformat
@@ -57,6 +61,46 @@ def clean(nb):
 def save(nb, path):
     with atomic_path(path) as temporary:
         nbformat.write(nb, temporary)
+
+
+@contextmanager
+def jupyter_lab(home, command, cwd, **environment):
+    """Run JupyterLab as long as the context lasts; gives its own notes: `url`, `token` and more.
+
+    Args:
+        home: folder of its log, settings and state.
+        command: Python's arguments, e.g. `["-m", "jupyterlab"]`.
+        cwd: where it is started.
+        environment: more variables.
+    """
+    places = {f"JUPYTER_{kind}_DIR": str(home / kind.lower()) for kind in ("CONFIG", "DATA", "RUNTIME")}
+    with (home / "log").open("w") as log:
+        server = subprocess.Popen(
+            [sys.executable, *map(str, command), "--no-browser", "--port=0"],
+            cwd=cwd,
+            env=os.environ | places | environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    try:
+        yield _notes(server, home)
+    finally:
+        server.terminate()  # it ends its kernels
+        try:
+            server.wait(20)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait()
+
+
+def _notes(server, home, seconds=60):
+    """Wait until the server has written where it listens, and with which token."""
+    end = time.monotonic() + seconds
+    while not (files := list(home.glob("runtime/jpserver-*[0-9].json"))):
+        assert server.poll() is None and time.monotonic() < end, (home / "log").read_text()
+        time.sleep(0.05)
+    return json.loads(files[0].read_text())
 
 
 def main():

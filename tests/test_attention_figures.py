@@ -6,7 +6,16 @@ import torch
 from matplotlib.patches import ConnectionPatch
 
 import tapip3d_lite as t3d
-from lessons.n04_figures import WAYS, Pair, cell_centers, entropy, fourier_waves, rates, two_bags, who_looks_where
+from lessons.n04 import (
+    WAYS,
+    AttentionPair,
+    cell_centers,
+    entropy,
+    fourier_waves,
+    rates,
+    two_bags,
+    who_looks_where,
+)
 from tapip3d_lite.geometry import project
 
 K = 4
@@ -37,7 +46,7 @@ def queries(clip):
 @pytest.fixture(scope="module")
 def pair(clip, queries):
     steps, grids = record(clip, queries)
-    return Pair.of(clip, steps, queries, grids, track=2, frame=5, level=0)
+    return AttentionPair.of(clip, steps, queries, grids, track=2, frame=5, level=0)
 
 
 def test_cells_stand_on_the_pixels_that_gave_them_their_points():
@@ -65,10 +74,10 @@ def test_a_pair_is_of_the_last_update_and_of_its_track(clip, queries, pair):
 def test_a_pair_that_was_not_recorded_is_refused(clip, queries):
     steps, grids = record(clip, queries)
     with pytest.raises(ValueError, match="track 4"):
-        Pair.of(clip, steps, queries, grids, track=4, frame=0)
-    assert Pair.of(clip, steps, queries, grids, track=4, frame=5).column == steps[-1].columns.index(4)
+        AttentionPair.of(clip, steps, queries, grids, track=4, frame=0)
+    assert AttentionPair.of(clip, steps, queries, grids, track=4, frame=5).column == steps[-1].columns.index(4)
     with pytest.raises(ValueError, match="frame"):
-        Pair.of(clip, steps, queries, grids, frame=99)
+        AttentionPair.of(clip, steps, queries, grids, frame=99)
 
 
 def test_two_bags_draw_all_tokens(pair):
@@ -106,7 +115,7 @@ def test_what_cannot_be_drawn_is_refused_in_words(clip, queries, pair):
         who_looks_where(pair, way="sideways")
     steps, grids = record(clip, queries, context="p2n")
     with pytest.raises(ValueError, match="context='n2n'"):
-        who_looks_where(Pair.of(clip, steps, queries, grids, frame=5))
+        who_looks_where(AttentionPair.of(clip, steps, queries, grids, frame=5))
 
 
 def test_entropy():

@@ -6,15 +6,12 @@ Everything is asked of the figures' state (plotly's slider and traces, the explo
 import json
 import os
 import shutil
-import subprocess
-import sys
 import threading
-import time
 
 import pytest
 
 from lessons.teaching import read_notebook
-from tests.notebook_tools import FOLDER, ROOT
+from tests.notebook_tools import FOLDER, ROOT, jupyter_lab
 
 BROWSERS = [
     *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge", "microsoft-edge"),
@@ -48,37 +45,10 @@ def lab(tmp_path_factory):
         file = home / "config/lab/user-settings/@jupyterlab" / f"{name}.jupyterlab-settings"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(values))
-    places = {f"JUPYTER_{kind}_DIR": str(home / kind.lower()) for kind in ("CONFIG", "DATA", "RUNTIME")}
-    options = ["--no-browser", "--port=0", "--expose-app-in-browser", "--allow-root"]
-    with (home / "log").open("w") as log:
-        server = subprocess.Popen(
-            [sys.executable, "-m", "jupyterlab", *options],
-            cwd=home / "notebooks",
-            # One thread: those of torch and of WebGL drawn without a graphics card would wait for one another.
-            env=os.environ | places | {"OMP_NUM_THREADS": "1"},
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-    try:
-        yield address(server, home)
-    finally:
-        server.terminate()  # it ends its kernels
-        try:
-            server.wait(20)
-        except subprocess.TimeoutExpired:
-            server.kill()
-            server.wait()
-
-
-def address(server, home, seconds=60):
-    """Wait until the server has written where it listens, and with which token."""
-    end = time.monotonic() + seconds
-    while not (files := list(home.glob("runtime/jpserver-*[0-9].json"))):
-        assert server.poll() is None and time.monotonic() < end, (home / "log").read_text()
-        time.sleep(0.05)
-    info = json.loads(files[0].read_text())
-    return f"{info['url']}lab/tree/{{}}?reset&token={info['token']}"  # no tabs of before
+    command = ["-m", "jupyterlab", f"--notebook-dir={home / 'notebooks'}", "--expose-app-in-browser", "--allow-root"]
+    # One thread: those of torch and of WebGL drawn without a graphics card would wait for one another.
+    with jupyter_lab(home, command, cwd=home, OMP_NUM_THREADS="1") as server:
+        yield f"{server['url']}lab/tree/{{}}?reset&token={server['token']}"  # no tabs of before
 
 
 @pytest.fixture(scope="module")

@@ -4,23 +4,22 @@ import numpy as np
 import pytest
 import torch
 
-import tapip3d_lite as t3d
-from lessons import EXERCISES
-from lessons.checker import Exercise, Mistake, compare, judge
+from lessons.checker import Exercise, Mistake, all_exercises, check, compare, judge, score_guess
 from tests.exercise_matrix import table
 
+EXERCISES = all_exercises()
 MISTAKES = [(name, mistake.name) for name, exercise in EXERCISES.items() for mistake in exercise.mistakes]
 
 
 @pytest.mark.parametrize("name", EXERCISES)
 def test_the_reference_passes(name):
-    assert t3d.exercises.check(name, EXERCISES[name].reference).status == "passed"
+    assert check(name, EXERCISES[name].reference).status == "passed"
 
 
 @pytest.mark.parametrize(("name", "mistake"), MISTAKES, ids=lambda part: part.replace(" ", "-"))
 def test_each_mistake_gets_its_hint(name, mistake):
     wrong = next(m for m in EXERCISES[name].mistakes if m.name == mistake)
-    verdict = t3d.exercises.check(name, wrong.answer)
+    verdict = check(name, wrong.answer)
     assert verdict.status == "wrong"
     assert verdict.hint == wrong.hint
 
@@ -37,10 +36,10 @@ def test_a_stub_is_not_an_error(name):
         raise NotImplementedError
 
     for stub in (lambda *_: None, lambda *_: ..., raising):
-        assert t3d.exercises.check(name, stub).status == "not attempted"
+        assert check(name, stub).status == "not attempted"
 
 
-def test_the_matrix_tells_every_answer_with_its_hint():
+def test_the_matrix_shows_every_answer_with_its_hint():
     lines = table()[2:]
     assert len(lines) == len(EXERCISES) + len(MISTAKES)
     assert sum("| the reference | passed |" in line for line in lines) == len(EXERCISES)
@@ -61,7 +60,7 @@ def test_a_wrong_answer_is_located_on_the_smallest_case(double):
     assert "1 of 3 values" in verdict.message
 
 
-def test_shape_type_and_crash_are_told_in_words(double):
+def test_shape_type_and_crash_are_said_in_words(double):
     assert "expected shape (1,), got (1, 1)" in judge(double, lambda x: 2 * x[None]).message
     assert "expected numbers" in judge(double, lambda x: "text").message
     crash = judge(double, lambda x: x + "1")
@@ -70,7 +69,7 @@ def test_shape_type_and_crash_are_told_in_words(double):
     assert judge(double, lambda x: x / 2).hint == "multiply, do not divide."
 
 
-def test_nan_and_dtype_are_told_in_words(double):
+def test_nan_and_dtype_are_said_in_words(double):
     assert "got nan (1 of 1 values differ, among them NaN)" in judge(double, lambda x: x * np.nan).message
     assert "expected whole numbers (int64), got float64" in compare(np.ones(2), np.ones(2, np.int64), 1e-6)
     assert compare(1.0, 1, 1e-6) == ""
@@ -109,7 +108,7 @@ def test_compare():
 
 
 def test_guesses():
-    score = t3d.exercises.score_guess
+    score = score_guess
     assert score(None, 3.0, "px").status == "not attempted"
     assert "3 px" in str(score(None, 3.0, "px"))
     assert (score(2.9, 3.0).status, score(6, 3.0).status) == ("passed", "wrong")
@@ -119,7 +118,15 @@ def test_guesses():
 
 
 def test_verdicts_show_themselves():
-    verdict = t3d.exercises.check("01.unproject", lambda *_: None)
+    verdict = check("01.unproject", lambda *_: None)
     assert "not attempted" in repr(verdict) and "<div" in verdict._repr_html_()
-    with pytest.raises(ValueError, match="no exercise"):
-        t3d.exercises.check("99.nothing", len)
+
+
+def test_exercises_are_found_by_their_notebooks_number():
+    assert [name for name in EXERCISES if name.startswith("03.")] == ["03.knn", "03.window", "03.walls", "03.proof"]
+    assert [name[:2] for name in EXERCISES] == sorted(name[:2] for name in EXERCISES)
+    with pytest.raises(ValueError, match=r"no exercise '03.nothing'; there are 03.knn, 03.window, 03.walls, 03.proof$"):
+        check("03.nothing", len)
+    for name in ("99.nothing", "", "../03.knn"):
+        with pytest.raises(ValueError, match=r"no exercise .* there are 00.lift, .*06.backward$"):
+            check(name, len)

@@ -1,4 +1,4 @@
-"""The table of formulas: it is what the code says, and a running tracker has the shapes that it tells."""
+"""The table of formulas: it is what the code says, and a running tracker has the shapes that it names."""
 
 import re
 import sys
@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from lessons.formulas import Formula, Symbol, find_function, formula_table, formulas
+from lessons.formulas import Formula, Symbol, find_function, formula_table, formulas, main
 from tapip3d_lite.geometry import transform
 from tapip3d_lite.model.frames import Frames, frames_from_clip
 from tapip3d_lite.recorder import Recorder
@@ -60,8 +60,7 @@ def run_everything():
     truth = Truth(still, torch.ones(still.shape[:3], dtype=torch.bool), rows[..., 0].long())
     for changes in CHANGES:
         torch.manual_seed(0)
-        tracker = t3d.Tracker(CONFIG.replace(**changes))
-        tracker.fast = False
+        tracker = t3d.Tracker(CONFIG.replace(**changes), fast=False)
         saving_backward(tracker, frames, rows, truth, LossConfig())
     tracker = t3d.Tracker(CONFIG)
     with Recorder(tracker, range(23)):
@@ -112,7 +111,7 @@ def watch(wanted, run):
 
 
 def test_the_committed_table_is_what_the_code_says():
-    assert TABLE.read_text(encoding="utf-8") == formula_table(), "run `python -m tapip3d_lite formulas` and commit"
+    assert TABLE.read_text(encoding="utf-8") == formula_table(), "run `python3 run.py formulas` and commit"
 
 
 def test_every_shape_is_that_of_a_running_tracker():
@@ -157,3 +156,9 @@ def test_the_lines_are_where_the_text_is():
     links = re.findall(r"\]\((.*?)#L\d+\)", TABLE.read_text(encoding="utf-8"))
     assert links and all((TABLE.parent / link).resolve().is_relative_to(root) for link in links)
     assert all((TABLE.parent / link).is_file() for link in links)
+
+
+def test_the_command_writes_the_table(tmp_path, capsys):
+    main(["--out", str(tmp_path / "new" / "F.md")])
+    assert (tmp_path / "new" / "F.md").read_text(encoding="utf-8") == formula_table()
+    assert "F.md" in capsys.readouterr().out

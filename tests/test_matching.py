@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from lessons import n04_matching as matching
-from lessons.n04_matching import paired_bags, similarity_attention, votes
+from lessons import n04_votes
+from lessons.n04_votes import paired_bags, similarity_attention, votes
 from tapip3d_lite.model.cloud import feature_cloud
 from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.model.registry import make_space
@@ -42,7 +42,7 @@ def by_loop(attention, support, context, width):
 
 @pytest.mark.parametrize("chunk", [1, 2**22])
 def test_votes_equal_the_loop(chunk, monkeypatch):
-    monkeypatch.setattr(matching, "_CHUNK", chunk)
+    monkeypatch.setattr(n04_votes, "_CHUNK", chunk)
     generator = torch.Generator().manual_seed(0)
     attention = torch.rand(3, K + 1, K, generator=generator).softmax(-1)
     support, context = torch.randn(3, K + 1, 3, generator=generator), torch.randn(3, K, 3, generator=generator)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import tapip3d_lite as t3d
-from lessons.n02_figures import motion_fit, paths_in_spaces
+from lessons.n02 import motion_fit, paths_in_spaces
 from lessons.n02_straightness import bend, to_space
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from matplotlib.patches import Circle
 
+from lessons.n03 import RIGHT, WRONG, Around, neighborhoods_3d, proof_view, share_curves, two_neighborhoods
 from lessons.n03_cells import Cells, silhouettes, track_objects
 from lessons.n03_exercises import search, walls
-from lessons.n03_figures import RIGHT, WRONG, Around, neighborhoods_3d, proof_view, share_curves, two_neighborhoods
 from tapip3d_lite.geometry import point_map, project
 from tapip3d_lite.simulate import object_maps, record, render_clip
 

@@ -1,15 +1,22 @@
 """Guards over the committed notebooks, and a run of each with its exercises solved."""
 
+import ast
 import json
 import re
+import sys
+from itertools import chain
+from urllib.request import Request, urlopen
 
 import nbformat
 import pytest
+from jupyter_client import BlockingKernelClient
 
 from lessons.teaching import solution_copy, solution_of, tags
-from tests.notebook_tools import ROOT, clean, notebooks, run
+from tests.notebook_tools import FOLDER, ROOT, clean, jupyter_lab, notebooks, run
 
 NOTEBOOKS = notebooks()
+CHECK = re.compile(r"n\d\d\.check\(")
+LIBRARIES = {"matplotlib", "numpy", "plotly", "tapip3d_lite", "torch"} | sys.stdlib_module_names
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 
 
@@ -80,12 +87,69 @@ def test_source_has_one_path_for_all(path):
 
 
 @each_notebook
+def test_imports_stand_together_and_name_no_lesson_but_its_own(path):
+    cells = [list(ast.walk(ast.parse(c.source))) for c in code_cells(read(path))]
+    imports = [[node for node in cell if isinstance(node, ast.Import | ast.ImportFrom)] for cell in cells]
+    assert sum(map(bool, imports)) <= 3
+    lessons = set()
+    for node in chain.from_iterable(imports):
+        names = [alias.name for alias in node.names]
+        modules = names if isinstance(node, ast.Import) else [f"{node.module}.{name}" for name in names]
+        lessons |= {module for module in modules if module.startswith("lessons")}
+        others = {module for module in modules if not module.startswith("lessons.")}
+        assert {module.split(".")[0] for module in others} <= LIBRARIES
+        assert not any(part.startswith("_") for module in modules for part in module.split("."))
+    assert lessons == {f"lessons.n{path.stem[:2]}"}
+
+
+def test_lessons_are_small_and_use_public_names():
+    for path in sorted((FOLDER / "lessons").glob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= 300, path.name
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ImportFrom):
+                assert node.module.split(".")[0] != "tests", path.name
+                names = [*node.module.split("."), *(alias.name for alias in node.names)]
+                assert not [name for name in names if name.startswith("_") and not name.startswith("__")], path.name
+
+
+def test_a_kernel_finds_the_lessons_wherever_lab_is_started(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    import run as command
+
+    called = []
+    monkeypatch.setattr(command, "_call", lambda *arguments: called.extend(arguments) or 0)
+    command.run_lab()
+    monkeypatch.delenv("PYTHONPATH", raising=False)  # the notebook's folder alone must do
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    with jupyter_lab(tmp_path, called, cwd=elsewhere) as server:
+        asked = {"path": NOTEBOOKS[0].name, "name": "", "type": "notebook", "kernel": {"name": "python3"}}
+        head = {"Authorization": f"token {server['token']}"}
+        session = json.load(urlopen(Request(f"{server['url']}api/sessions", json.dumps(asked).encode(), head)))
+        client = BlockingKernelClient(
+            connection_file=str(tmp_path / "runtime" / f"kernel-{session['kernel']['id']}.json")
+        )
+        client.load_connection_file()
+        client.start_channels()
+        try:
+            client.wait_for_ready(60)
+            wanted = {"file": "checker.__file__"}
+            reply = client.execute("from lessons import checker", user_expressions=wanted, reply=True, timeout=60)
+        finally:
+            client.stop_channels()
+    assert reply["content"]["user_expressions"]["file"]["data"]["text/plain"] == repr(
+        str(FOLDER / "lessons/checker.py")
+    )
+
+
+@each_notebook
 def test_exercises_are_whole(path):
     nb = read(path)
     stubs = [i for i, c in enumerate(nb.cells) if "exercise" in tags(c)]
     assert len(stubs) >= 3
     for i in stubs:
-        assert "exercises.check(" in nb.cells[i + 1].source, nb.cells[i].source
+        assert CHECK.match(nb.cells[i + 1].source), nb.cells[i].source
         assert len(solution_of(nb, i)) > 20
         after = "".join(c.source for c in nb.cells[i + 1 : i + 5] if c.cell_type == "markdown")
         assert after.count("<summary>Hint") >= 2, nb.cells[i].source
@@ -98,7 +162,7 @@ def test_solutions_pass(path):
     nb = run(solution_copy(read(path)))
     warned = [o.text for _, o in outputs(nb) if o.get("name") == "stderr" and "Warning" in o.text]
     assert not warned, warned[0]  # `clean` would hide it from the stored notebook
-    checkers = [c for c in code_cells(nb) if "exercises.check(" in c.source]
+    checkers = [c for c in code_cells(nb) if CHECK.match(c.source)]
     assert len(checkers) == sum("exercise" in tags(c) for c in nb.cells)
     for cell in checkers:
         shown = "".join(o.get("data", {}).get("text/plain", "") for o in cell.outputs)
@@ -108,7 +172,7 @@ def test_solutions_pass(path):
 @each_notebook
 def test_stubs_are_not_attempted_in_the_committed_outputs(path):
     for cell, output in outputs(read(path)):
-        if "exercises.check(" in cell.source:
+        if CHECK.match(cell.source):
             assert "not attempted" in output["data"]["text/plain"], cell.source
 
 

@@ -1,4 +1,4 @@
-"""The teacher's pack: the student's notebook is the solved one minus blanks, and the plan tells the notebooks' minutes."""
+"""The teacher's pack: the student's notebook is the solved one minus blanks, and the plan gives the notebooks' minutes."""
 
 import json
 import re
@@ -9,6 +9,7 @@ import pytest
 
 from lessons.teaching import (
     handout,
+    main,
     minutes,
     read_notebook,
     solution_copy,
@@ -84,10 +85,13 @@ def test_the_pack_has_what_its_notebooks_load_and_link(pack):
             assert (path.parent / name).exists(), name
         for name in re.findall(r"\]\((\w+\.md)\)", text):
             assert (path.parent / name).is_file(), name
+    for folder in ("student", "solution"):
+        lessons = {p.name: p.read_bytes() for p in (ROOT / "notebooks" / "lessons").iterdir() if p.is_file()}
+        assert {p.name: p.read_bytes() for p in (pack / folder / "lessons").iterdir()} == lessons
     assert "](../tapip3d_lite" not in (pack / "student" / "FORMULAS.md").read_text("utf-8")
 
 
-def test_the_plan_tells_every_exercise_and_adds_up(pack):
+def test_the_plan_has_every_exercise_and_adds_up(pack):
     lines = (pack / "TIMING.md").read_text("utf-8").splitlines()
     rows = {line.split(" | ")[0].strip("| "): line.strip("|").split(" | ") for line in lines if line.startswith("| ")}
     for path in NOTEBOOKS:
@@ -98,12 +102,12 @@ def test_the_plan_tells_every_exercise_and_adds_up(pack):
     assert len(lines) < 60  # one page
 
 
-def test_the_readme_tells_the_same_minutes():
+def test_the_readme_gives_the_same_minutes():
     readme = (ROOT / "README.md").read_text("utf-8")
-    told = dict(re.findall(r"\(notebooks/(\w+)\.ipynb\) \|.*\| (\d+)\D* \|", readme))
-    assert told
-    assert {name: int(value) for name, value in told.items()} == {
-        path.stem: minutes(read_notebook(path)) for path in NOTEBOOKS if path.stem in told
+    shown = dict(re.findall(r"\(notebooks/(\w+)\.ipynb\) \|.*\| (\d+)\D* \|", readme))
+    assert shown
+    assert {name: int(value) for name, value in shown.items()} == {
+        path.stem: minutes(read_notebook(path)) for path in NOTEBOOKS if path.stem in shown
     }
 
 
@@ -143,7 +147,7 @@ def test_what_is_missing_is_named(course, tmp_path):
     with pytest.raises(ValueError, match="c: its exercises take 10 minutes"):
         timing_plan({"c": course})
     course["cells"][0]["source"] = "# x"
-    with pytest.raises(ValueError, match="tell its minutes"):
+    with pytest.raises(ValueError, match="say its minutes"):
         timing_plan({"c": course})
     course["cells"][3]["source"] = "### Exercise 1.1 · One"
     with pytest.raises(ValueError, match="before the stub"):
@@ -151,3 +155,16 @@ def test_what_is_missing_is_named(course, tmp_path):
     del course["cells"][5]
     with pytest.raises(ValueError, match="no folded solution"):
         solution_copy(course)
+
+
+def test_the_command_writes_the_pack_and_refuses_in_one_line(tmp_path, capsys):
+    main(["--out", str(tmp_path / "pack"), "--lesson", "30"])
+    assert "a lesson has 30" in (tmp_path / "pack" / "TIMING.md").read_text("utf-8")
+    capsys.readouterr()
+    wrong = [[], ["--out", str(tmp_path / "pack" / "TIMING.md")]]
+    wrong += [["--out", str(tmp_path), option, value] for option, value in (("--lesson", "0"), ("--notebooks", "none"))]
+    for arguments in wrong:
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        shown = capsys.readouterr().err
+        assert stop.value.code == 2 and shown.startswith("run.py teach: ") and len(shown.splitlines()) == 1

@@ -3,6 +3,9 @@
 import asyncio
 import json
 import signal
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,11 +13,11 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from lessons.n02_figures import MOVING
+from lessons.n06 import LivePlot, learning_curve, tracks_and_truth, train_live
 from lessons.n06_augmentations import TITLES, before_and_after, motion_paths
 from lessons.n06_chain import Chain, plain, saving
-from lessons.n06_live import LivePlot, learning_curve, learning_curves, tracks_and_truth, train_live
-from tapip3d_lite import commands
+from tapip3d_lite.figures.curves import learning_curves
+from tapip3d_lite.figures.flat import MOVING
 from tapip3d_lite.simulate import simulate_dataset
 from tapip3d_lite.training import plan
 from tapip3d_lite.training.config import TrainConfig
@@ -22,6 +25,7 @@ from tapip3d_lite.training.plan import fit_to_time
 from tapip3d_lite.training.sampling import SamplingConfig
 from tapip3d_lite.training.trainer import Trainer
 
+ROOT = Path(__file__).resolve().parents[1]
 SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
 SIZES |= {"context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2}
 SIZES |= {"time_depth": 1, "space_depth": 1, "virtual_tracks": 4}
@@ -57,7 +61,7 @@ def drawn(ax):
 
 def test_curves_show_each_line_its_mean_and_what_was_held_out(lines):
     zero = {"APD3D_none": 0.45, "APD3D_none_dynamic": 0.15, "OA": 0.9}
-    left, middle, right = learning_curve(lines, zero, window=2).axes
+    left, middle, right = learning_curves([("", lines)], zero, window=2).axes
     assert drawn(left) == [([1, 2], [0.25, 0.5]), ([1, 2], [0.25, 0.375])]
     assert drawn(middle) == [([3, 4], [0.4, 0.2]), ([3, 4], [0.4, 0.3])] and middle.get_yscale() == "log"
     assert drawn(right)[:3] == [([3, 4], [0.2, 0.4]), ([3, 4], [0.2, 0.3]), ([4], [0.5])]
@@ -67,26 +71,27 @@ def test_curves_show_each_line_its_mean_and_what_was_held_out(lines):
 
 
 def test_curves_over_minutes_of_a_window_and_of_nothing(lines):
-    middle = learning_curve(lines, by="minutes", window=1).axes[1]
+    middle = learning_curves([("", lines)], by="minutes", window=1).axes[1]
     assert drawn(middle) == [([1, 2], [0.4, 0.2])] * 2
     assert not any(ax.lines for ax in learning_curve([]).axes if ax.get_ylabel() != "APD3D")
     for wrong in ({"by": "day"}, {"window": 0}):
-        with pytest.raises(ValueError, match="learning_curve"):
-            learning_curve(lines, **wrong)
+        with pytest.raises(ValueError, match="learning_curves"):
+            learning_curves([("", lines)], **wrong)
 
 
 def test_trainings_have_a_row_each_and_the_command_draws_them(lines, tmp_path):
     figure = learning_curves([("first", lines), ("second", lines[:2])], window=2)
     rows = np.reshape(figure.axes, (2, 3))
     assert [row[0].get_ylabel().splitlines()[0] for row in rows] == ["first", "second"]
-    assert drawn(rows[0, 1]) == drawn(learning_curve(lines, window=2).axes[1]) and not rows[1, 1].lines
+    assert drawn(rows[0, 1]) == drawn(learning_curves([("", lines)], window=2).axes[1]) and not rows[1, 1].lines
     texts = [[text.get_text() for text in learning_curve(part).axes[0].texts] for part in (lines, lines[2:])]
     assert texts == [[], ["as it was"]]  # a training that takes its encoder as it finds it
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    commands.curves((tmp_path, tmp_path / "log.jsonl"), out=tmp_path / "c.png")
+    command = [sys.executable, "-m", "tapip3d_lite", "curves", "--out", str(tmp_path / "c.png")]
+    subprocess.run([*command, str(tmp_path), str(tmp_path / "log.jsonl")], check=True, cwd=ROOT)
     assert (tmp_path / "c.png").read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(ValueError, match="no such log"):
-        commands.curves((tmp_path / "none",), out=tmp_path / "d.png")
+    absent = subprocess.run([*command, str(tmp_path / "none")], cwd=ROOT, capture_output=True, text=True)
+    assert absent.returncode == 2 and "no such log" in absent.stderr
 
 
 def test_learnt_tracks_stand_beside_the_truth():
@@ -164,7 +169,7 @@ def test_drawing_takes_a_small_share_of_the_time(trainer, monkeypatch):
         clock[0] += 10.0
         draw(live)
 
-    monkeypatch.setattr("lessons.n06_live.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr("lessons.n06.time", SimpleNamespace(monotonic=lambda: clock[0]))
     monkeypatch.setattr(LivePlot, "draw", slow)
     step = trainer._one_step
     monkeypatch.setattr(trainer, "_one_step", lambda: (clock.__setitem__(0, clock[0] + 100.0), step())[1])
@@ -185,7 +190,7 @@ def test_the_button_is_heard_between_two_steps(trainer, monkeypatch):
     assert len(asyncio.run(cell())) <= 4
 
 
-def test_what_goes_wrong_while_watched_is_told(trainer, monkeypatch):
+def test_what_goes_wrong_while_watched_is_raised(trainer, monkeypatch):
     def fail(*_):
         raise FloatingPointError("not finite")
 

@@ -5,8 +5,19 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
+from lessons.n05 import (
+    converging,
+    film,
+    paired,
+    random_tracker,
+    time_in_turns,
+    time_ratios,
+    token_bar,
+    token_parts,
+    windows_chart,
+    without,
+)
 from lessons.n05_exercises import window_starts
-from lessons.n05_figures import converging, film, paired, token_bar, token_parts, windows_chart, without
 from tapip3d_lite.geometry import project
 from tapip3d_lite.model.updater import token_width
 from tapip3d_lite.model.windows import window_ends
@@ -123,3 +134,18 @@ def test_paired_shows_every_clip():
     ax = paired({"a": np.array([1.0, 2, 3]), "b": np.array([0.0, 0])}, "difference").axes[0]
     assert list(ax.lines[0].get_xdata()) == [1, 2, 3]
     assert [t.get_text() for t in ax.get_yticklabels()] == ["a", "b"]
+
+
+def test_a_random_tracker_is_the_same_in_both_forms_and_leaves_the_generator_alone(clip, queries):
+    sizes = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "iterations": 1, "hidden": 32}
+    before = torch.random.get_rng_state()
+    fast, clear = (random_tracker(fast=fast, **sizes).track(clip, queries) for fast in (True, False))
+    assert torch.equal(torch.random.get_rng_state(), before)
+    np.testing.assert_allclose(fast.xyz, clear.xyz, atol=1e-4)
+
+
+def test_functions_are_timed_in_turns():
+    called = []
+    seconds = time_in_turns({name: lambda name=name: called.append(name) for name in "ab"}, rounds=3)
+    assert "".join(called) == "abababab" and {name: len(times) for name, times in seconds.items()} == {"a": 3, "b": 3}
+    assert time_ratios([2, 6, 3], [1, 2, 2]) == (1.5, 2, 3)

@@ -1,7 +1,8 @@
 """Checked exercises: the learner's function against a reference on random cases, from small to large.
 
 A wrong answer is shown the smallest case on which it fails, where it differs, and a hint. The hint is chosen by what
-the answer computes: if it agrees with a known mistake on that case, it gets the hint for that mistake.
+the answer computes: if it agrees with a known mistake on that case, it gets the hint for that mistake. The exercises of
+notebook 03 are in `n03.EXERCISES`, and so on.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import html
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 
@@ -76,6 +79,35 @@ class Verdict:
         _, color = _ICONS[self.status]
         style = f"border-left:4px solid {color};padding:2px 10px;white-space:pre-wrap;font-family:monospace"
         return f'<div style="{style}">{html.escape(str(self))}</div>'
+
+
+def check(name: str, answer: Answer) -> Verdict:
+    """Judge a learner's function.
+
+    Args:
+        name: the exercise, e.g. `"01.unproject"`.
+        answer: the function.
+
+    Raises:
+        ValueError: there is no such exercise.
+    """
+    known = {exercise.name: exercise for exercise in exercises_of(name[:2])}
+    if name not in known:
+        raise ValueError(f"check: no exercise {name!r}; there are {', '.join(known or all_exercises())}")
+    return judge(known[name], answer)
+
+
+def exercises_of(notebook: str) -> tuple[Exercise, ...]:
+    """The exercises of the notebook with a number, e.g. `"03"`; none where no lesson has it."""
+    if not Path(__file__).with_name(f"n{notebook}.py").is_file():
+        return ()
+    return import_module(f"{__package__}.n{notebook}").EXERCISES
+
+
+def all_exercises() -> dict[str, Exercise]:
+    """All exercises by name, in the order of the notebooks."""
+    numbers = (path.stem[1:] for path in sorted(Path(__file__).parent.glob("n[0-9][0-9].py")))
+    return {exercise.name: exercise for number in numbers for exercise in exercises_of(number)}
 
 
 def judge(exercise: Exercise, answer: Answer) -> Verdict:

@@ -1,6 +1,6 @@
 """The table "formula → symbol → tensor → shape → file:line", written from the code so that it cannot go stale.
 
-`formulas.txt` says which function computes which formula of the paper, in which line (a piece of its text) and by which
+`python3 run.py formulas` writes it. `formulas.txt` says which function computes which formula of the paper, in which line (a piece of its text) and by which
 tensors. File and line numbers are looked up here; the tests run a small tracker and compare every shape.
 """
 
@@ -10,23 +10,36 @@ import ast
 import inspect
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import FunctionType
+
+from lessons.tool import ToolParser
+from tapip3d_lite.files import atomic_path
 
 _ROWS = Path(__file__).with_name("formulas.txt")
 
 _HEAD = """# From formula to line of code
 
 Every equation of the method, the tensor that holds each of its symbols, its shape, and the line where it happens.
-Written by `python -m tapip3d_lite formulas`; the tests compare it with the code and its shapes with a running tracker.
+Written by `python3 run.py formulas`; the tests compare it with the code and its shapes with a running tracker.
 
 B clips, T frames (T' padded to whole half windows), S frames of a window, N tracks, n of them in a window,
 n_t queried in one frame, K neighbours, L levels, M iterations, H x W pixels, h x w cells of the finest level, h_l x w_l
 of level l, C feature channels, D width of a neighbourhood token, A heads of A_dim channels in it, G width of the
 trajectory token, U width of the updater, V virtual tracks.
+
+Sections, and equations (1) to (4), are those of the paper; N2N attention has no numbered equation there. Where the paper
+and the released code differ, this kit computes what the released code does:
+
+| | paper | released code and this kit |
+|---|---|---|
+| support | K tokens | K + 1 tokens, the query first |
+| motion | the next estimate minus this one | this estimate minus the next, and minus the one before |
+| time | concatenated to the token | added to the token |
+| loss | distances over the true depth, summed | also times the focal length, and averaged; `form="paper"` leaves the focal length out |
 """
 
 
@@ -76,9 +89,9 @@ class Formula:
     def line_of(self, symbol: Symbol) -> int:
         """Number of the first line that mentions a tensor; ValueError where the function does not."""
         lines, first = inspect.getsourcelines(self.code())
-        told = list(_expressions(lines))
+        named = list(_expressions(lines))
         wanted = (symbol.tensor, re.split(r"[.\[]", symbol.tensor)[0])  # `near.points` may be known as `near` only
-        numbers = next(filter(None, ([line for line, text in told if text == name] for name in wanted)), [])
+        numbers = next(filter(None, ([line for line, text in named if text == name] for name in wanted)), [])
         if not numbers:
             raise ValueError(f"{self.function}: nothing is called {symbol.tensor!r} there; mend it in formulas.txt")
         return first + (max(numbers) if symbol.tensor == "return" else min(numbers)) - 1
@@ -155,3 +168,17 @@ def _expressions(lines: list[str]) -> Iterator[tuple[int, str]]:
             yield node.lineno, "return"
         elif isinstance(node, ast.expr):
             yield node.lineno, ast.unparse(node)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Write the table to `notebooks/FORMULAS.md`, or to `--out`."""
+    parser = ToolParser("formulas", "Write the table of formulas from the code.")
+    parser.add_argument("--out", type=Path, default=_ROWS.parents[1] / "FORMULAS.md", help="Markdown file")
+    out = parser.parse_args(argv).out
+    with parser.complaints(), atomic_path(out) as temporary:
+        temporary.write_text(formula_table(), encoding="utf-8")
+    print(f"wrote {out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lessons.checker import Exercise, Mistake
-from lessons.n01_exercises import random_extrinsics, random_intrinsics
+from lessons.n01 import random_extrinsics, random_intrinsics
 from lessons.n02_straightness import fit_windows, from_space, to_space
 from tapip3d_lite.geometry import invert, transform, unproject
 

@@ -1,6 +1,6 @@
 """Which neighbours lie on the right object: cells of a frame's cloud with their objects, and distances to silhouettes.
 
-Paper: section 3.3 (k-NN in 3D) and table 6 (against a fixed window in 2D). The claim is measured here without any
+Paper: section 3.2 (k-NN in 3D) and the table on neighbourhoods (against a fixed window in 2D). The claim is measured here without any
 tracker: the query stands on a known object, the simulator knows the object of every cell, and so the share of a
 neighbourhood that lies on the query's own object is a plain count.
 """
@@ -45,7 +45,7 @@ class Cells:
 
         Args:
             clip: T frames.
-            objects: (T, H, W) int, see `simulate.object_maps`.
+            objects: (T, H, W) int, from `simulate.object_maps`.
             frame: which one.
             stride: pixels per cell; level l of a tracker has its own stride times 2^l.
 

@@ -9,9 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lessons.n02_figures import MOVING, STILL
 from tapip3d_lite.clip import Clip, Tracks
-from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
+from tapip3d_lite.figures.flat import INK, MOVING, STILL, check_drawable, draw_image, label_axes
 from tapip3d_lite.geometry import invert, project
 from tapip3d_lite.training.augment import AugmentConfig, augmentations
 from tapip3d_lite.training.motion import MotionConfig, move, smooth_motion
@@ -56,8 +55,8 @@ def before_and_after(clip: Clip, seed: int = 0, frame: int = 0, config: AugmentC
         at = len(clip) - 1 - frame if name == "flip_time" else frame
         detail = _edge(clip.depths[frame]) if "blur" in name else None
         for pair, shown, t, word in ((row[:2], clip, frame, "before"), (row[2:], changed, at, "after")):
-            _image(pair[0], shown.video[t], f"{TITLES[name]}: {word}")
-            _image(pair[1], np.ma.masked_equal(shown.depths[t], 0), "")
+            draw_image(pair[0], shown.video[t], f"{TITLES[name]}: {word}")
+            draw_image(pair[1], np.ma.masked_equal(shown.depths[t], 0), "")
             pair[1].images[0].set(cmap="viridis_r", clim=(0, far))
             pair[1].set_facecolor("#cccccc")  # invalid
             for ax in pair:
@@ -84,15 +83,15 @@ def motion_paths(
         raise ValueError(f"motion_paths: clip {clip.name!r} has no true tracks with `dynamic`; simulate one")
     extra = smooth_motion(np.random.default_rng(seed), len(clip), config or MotionConfig())
     camera = clip.extrinsics.astype(np.float64)
-    told = {"world": (clip, (0, 1)), "camera": (move(clip, camera), (0, 2))}
-    told["camera, moved smoothly"] = move(clip, extra @ camera), (0, 2)
+    views = {"world": (clip, (0, 1)), "camera": (move(clip, camera), (0, 2))}
+    views["camera, moved smoothly"] = move(clip, extra @ camera), (0, 2)
     figure = Figure(figsize=(12, 3.2), layout="constrained")
     axes = figure.subplots(1, 4)
     chosen = _spread(clip.tracks, still, moving)
-    for ax, (name, (shown, pair)) in zip(axes, told.items(), strict=False):
+    for ax, (name, (shown, pair)) in zip(axes, views.items(), strict=False):
         _paths(ax, shown.tracks, chosen, pair)
         horizontal, vertical = (("x (m)", "y (m)"), ("x right (m)", "z forward (m)"))[pair == (0, 2)]
-        _plot(ax, vertical, horizontal)
+        label_axes(ax, vertical, horizontal)
         ax.set_aspect("equal", adjustable="datalim")
         ax.set_title(f"{name}, from above", fontsize=8, color=INK)
     for motion, label, style in ((camera, "camera", "--"), (extra, "random motion on top", "-")):
@@ -100,7 +99,7 @@ def motion_paths(
         cosine = (np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2
         angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         axes[3].plot(np.arange(1, len(clip)), angle, style, color=INK, lw=1.3, label=label)
-    _plot(axes[3], "degrees a frame", "frame")
+    label_axes(axes[3], "degrees a frame", "frame")
     axes[3].set_ylim(bottom=0)
     axes[3].set_title("turn of the coordinates", fontsize=8, color=INK)
     axes[3].legend(fontsize=7, frameon=False)

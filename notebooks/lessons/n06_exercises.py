@@ -1,4 +1,4 @@
-"""Exercises of notebook 06: what counts, the loss and its discount; the backward is in `chain`."""
+"""Exercises of notebook 06: what counts, the loss and its discount; the backward pass is in `n06_chain`."""
 
 from __future__ import annotations
 

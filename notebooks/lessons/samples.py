@@ -1,13 +1,16 @@
-"""The sample clips: which seeds and settings they come from, and one function that writes them again."""
+"""The sample clips: which seeds and settings they come from. `python3 run.py samples` writes them again."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from tapip3d_lite.clip import Clip
+from lessons.tool import ToolParser
+from tapip3d_lite.clip import Clip, load_clip
+from tapip3d_lite.figures import overview, save_png
 from tapip3d_lite.files import atomic_path
 from tapip3d_lite.simulate.config import SimulationConfig
 from tapip3d_lite.simulate.simulator import simulate_clip
@@ -62,7 +65,7 @@ SAMPLES = {
 
 
 def write_samples(folder: str | Path = "data_samples") -> list[Path]:
-    """Simulate all `SAMPLES` and write them to a folder, with a README that tells what each is for.
+    """Simulate all `SAMPLES` and write them to a folder, with a README that says what each is for.
 
     To keep the files small, depths are rounded to 16 bits of mantissa: a relative error of at most 8e-6.
 
@@ -84,6 +87,13 @@ def write_samples(folder: str | Path = "data_samples") -> list[Path]:
     return paths
 
 
+def write_picture(folder: str | Path = "data_samples") -> Path:
+    """Draw true tracks of the clip `arc` in a folder of samples over its frames and depth, as the project's README shows."""
+    clip, path = load_clip(Path(folder) / "arc.npz"), Path(folder) / "picture.png"
+    save_png(overview(clip, clip.tracks.select(slice(0, None, 3))), path)
+    return path
+
+
 def round_mantissa(values: np.ndarray, bits: int) -> np.ndarray:
     """Round float32 values to `bits` (1 to 22) bits of mantissa: relative error at most 2^-(bits + 1); 0 stays 0."""
     drop = np.uint32(23 - bits)
@@ -94,7 +104,7 @@ def round_mantissa(values: np.ndarray, bits: int) -> np.ndarray:
 _HEAD = """# Sample clips
 
 Simulated with exact depth, cameras, 3D tracks and visibility; all motion is rigid, lengths are metres. Read one with
-`tapip3d_lite.load_clip(path)`; write all of them again with `python -m tapip3d_lite samples`. Depths are rounded to 16
+`tapip3d_lite.load_clip(path)`; write all of them again with `python3 run.py samples`. Depths are rounded to 16
 bits of mantissa (relative error at most 8e-6) to keep the files small. Pictures and text are ours (Apache-2.0).
 
 "Dynamic" is the share of tracks on bodies that move in the world; "hidden" is the share of their points that are out
@@ -122,3 +132,18 @@ def longest_gap(visible: np.ndarray) -> np.ndarray:
         gap = np.where(seen & (last >= 0), t - last - 1, 0)
         longest, last = np.maximum(longest, gap), np.where(seen, t, last)
     return longest
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Write all sample clips, their README and the picture."""
+    parser = ToolParser("samples", "Write the sample clips, their table and a picture of one again from their seeds.")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[2] / "data_samples", help="their folder")
+    out = parser.parse_args(argv).out
+    with parser.complaints():
+        count = len(write_samples(out))
+        write_picture(out)
+    print(f"wrote {count} clips, their table and a picture to {out}")
+
+
+if __name__ == "__main__":
+    main()

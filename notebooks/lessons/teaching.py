@@ -1,6 +1,6 @@
 """The teacher's pack: every notebook once for students and once solved, and a timing plan, from the notebooks alone.
 
-A stub is a code cell tagged `exercise`. Its solution is folded into a later text cell, its title, difficulty and minutes
+`python3 run.py teach --out PACK` writes it. A stub is a code cell tagged `exercise`. Its solution is folded into a later text cell, its title, difficulty and minutes
 stand in the cell before it. Notebooks are plain dictionaries as in their JSON; `nbformat`'s do as well.
 """
 
@@ -10,10 +10,12 @@ import copy
 import json
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lessons.tool import ToolParser
 from tapip3d_lite.files import atomic_path
 
 Notebook = dict[str, Any]
@@ -92,7 +94,7 @@ def handout(nb: Notebook) -> Notebook:
 
 
 def tasks(nb: Notebook) -> list[Task]:
-    """The exercises of a notebook with their minutes; ValueError where the cell before a stub does not tell them."""
+    """The exercises of a notebook with their minutes; ValueError where the cell before a stub does not say them."""
     found = []
     for i in stubs(nb):
         before = nb["cells"][i - 1]["source"] if i else ""
@@ -106,7 +108,7 @@ def tasks(nb: Notebook) -> list[Task]:
 
 
 def minutes(nb: Notebook) -> int:
-    """Minutes for reading and solving a notebook, from the line of its opening that tells them; ValueError without."""
+    """Minutes for reading and solving a notebook, from the line of its opening that says them; ValueError without."""
     opening = "\n".join(cell["source"] for cell in nb["cells"][:3] if cell["cell_type"] == "markdown")
     found = [
         (not re.search("read", line, re.IGNORECASE), m[1])
@@ -115,7 +117,7 @@ def minutes(nb: Notebook) -> int:
     ]
     if not found:
         raise ValueError(
-            f"expected the opening to tell its minutes, e.g. 'Reading and exercises: 40 minutes', got:\n{opening[:300]}"
+            f"expected the opening to say its minutes, e.g. 'Reading and exercises: 40 minutes', got:\n{opening[:300]}"
         )
     return int(min(found, key=lambda pair: pair[0])[1])  # else the first one
 
@@ -126,11 +128,16 @@ def timing_plan(notebooks: dict[str, Notebook], lesson: int = 45) -> str:
     Args:
         notebooks: name to notebook, in the order of the course.
         lesson: minutes of one lesson.
+
+    Raises:
+        ValueError: a lesson of no minute, or exercises that take longer than their notebook.
     """
+    if lesson < 1:
+        raise ValueError(f"lesson: expected at least 1 minute, got {lesson}")
     lines = [
         "# Timing plan",
         "",
-        f"Minutes as the notebooks tell them; a lesson has {lesson}. Together: what is shown and talked through in class.",
+        f"Minutes as the notebooks give them; a lesson has {lesson}. Together: what is shown and talked through in class.",
         "",
         "| notebook | minutes | lessons | together | exercises: title, difficulty, minutes |",
         "|---|---|---|---|---|",
@@ -141,18 +148,18 @@ def timing_plan(notebooks: dict[str, Notebook], lesson: int = 45) -> str:
         rest = whole - sum(task.minutes for task in todo)
         if rest < 0:
             raise ValueError(f"{name}: its exercises take {whole - rest} minutes, more than the {whole} of the opening")
-        told = " · ".join(f"{' '.join(filter(None, (t.number, t.title)))} {t.stars} {t.minutes}" for t in todo)
-        lines.append(f"| {name} | {whole} | {-(-whole // lesson)} | {rest} | {told} |")
+        shown = " · ".join(f"{' '.join(filter(None, (t.number, t.title)))} {t.stars} {t.minutes}" for t in todo)
+        lines.append(f"| {name} | {whole} | {-(-whole // lesson)} | {rest} | {shown} |")
         total, together = total + whole, together + rest
     lines.append(f"| all | {total} | {-(-total // lesson)} | {together} | {total - together} minutes |")
     return "\n".join(lines) + "\n"
 
 
 def write_pack(notebooks: Path, out: Path, lesson: int = 45) -> list[Path]:
-    """Write the pack: `student/` and `solution/` notebooks, `TIMING.md`, and the clips that they load.
+    """Write the pack: `student/` and `solution/` notebooks, `TIMING.md`, and what they load: clips and lessons.
 
     Args:
-        notebooks: folder of the numbered notebooks; `data_samples` lies beside it.
+        notebooks: folder of the numbered notebooks and of `lessons`; `data_samples` lies beside it.
         out: the pack's folder.
         lesson: minutes of one lesson.
 
@@ -175,7 +182,25 @@ def write_pack(notebooks: Path, out: Path, lesson: int = 45) -> list[Path]:
     for path, text in files.items():
         with atomic_path(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    samples = notebooks.parent / "data_samples"
-    if samples.is_dir():
-        shutil.copytree(samples, out / "data_samples", dirs_exist_ok=True)
+    loaded = {"data_samples": notebooks.parent / "data_samples"}
+    loaded |= {f"{folder}/lessons": notebooks / "lessons" for folder in ("student", "solution")}
+    for name, source in loaded.items():
+        if source.is_dir():
+            shutil.copytree(source, out / name, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
     return list(files)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Write the pack."""
+    parser = ToolParser("teach", "Write student and solution versions of all notebooks, and a timing plan.")
+    parser.add_argument("--out", type=Path, required=True, help="the pack's folder")
+    parser.add_argument("--notebooks", type=Path, default=Path(__file__).parents[1], help="folder of the notebooks")
+    parser.add_argument("--lesson", type=int, default=45, help="minutes of one lesson")
+    options = parser.parse_args(argv)
+    with parser.complaints():
+        written = write_pack(options.notebooks, options.out, options.lesson)
+    print(f"wrote {len(written)} files to {options.out}; begin with {options.out / 'TIMING.md'}")
+
+
+if __name__ == "__main__":
+    main()

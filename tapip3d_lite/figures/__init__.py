@@ -1,4 +1,4 @@
-"""All figures of the kit: pure functions of clips and tracks that return figure objects, and what shows or saves them.
+"""Figures: pure functions of clips, tracks and scores that return figure objects, and what shows or saves them.
 
 Flat figures are matplotlib `Figure`s made without pyplot, so nothing stays open behind the reader's back. 3D figures
 are plotly with a time slider; `show_3d` pairs each with a matplotlib twin for viewers that run no JavaScript.

@@ -1,15 +1,17 @@
-"""Figure of the benchmark: means with intervals, tracker by tracker, for all points and for those that move."""
+"""Scores of the benchmark as means with intervals, and the learning curves of trainings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from tapip3d_lite.evaluation.benchmark import SPLITS, Results, estimate
-from tapip3d_lite.figures.flat import INK
+from tapip3d_lite.figures.flat import INK, MOVING, STILL, label_axes
 
 COLORS = ("#8a8f98", "#e8a33d", "#2b6cb0", "#d1495b", "#2f855a", "#6b46c1")
 NAMES = {
@@ -19,6 +21,8 @@ NAMES = {
     "APD3D": "APD 3D, median scale",
     "OA": "OA",
 }
+Line = Mapping[str, Any]
+_SERIES = {"apd": ("all points", STILL), "apd_dynamic": ("moving points", MOVING)}
 
 
 def score_figure(
@@ -55,6 +59,34 @@ def score_figure(
     return figure
 
 
+def learning_curves(
+    logs: Sequence[tuple[str, Sequence[Line]]],
+    zero_motion: Mapping[str, float] | None = None,
+    by: str = "step",
+    window: int = 100,
+) -> Figure:
+    """How trainings went, one row each: matching of the encoder, loss, APD3D on examples (lines) and held-out clips (dots).
+
+    Args:
+        logs: name and lines of the log of each training; there may be no lines yet, and the name may be empty.
+        zero_motion: scores of zero motion on the held-out clips, drawn dashed: `APD3D_none`, `APD3D_none_dynamic`.
+        by: horizontal axis, `"step"` or `"minutes"` of training.
+        window: steps over which the bold lines are averaged; the raw values stay behind them.
+
+    Raises:
+        ValueError: another `by`, or a window of no step.
+    """
+    if by not in ("step", "minutes") or window < 1:
+        raise ValueError(f'learning_curves: expected by="step" or "minutes", window >= 1, got {by!r}, {window}')
+    figure = Figure(figsize=(11, 2.9 * len(logs)), layout="constrained")
+    rows = figure.subplots(len(logs), 3, squeeze=False)
+    for axes, (name, lines) in zip(rows, logs, strict=True):
+        _row(axes, lines, zero_motion, by, window)
+        if name:
+            axes[0].set_ylabel(f"{name}\n\n{axes[0].get_ylabel()}", fontsize=8)
+    return figure
+
+
 def _dots(ax: Axes, results: Results, split: str, metric: str, top: float) -> None:
     for index, (color, label) in enumerate(zip(_colors(results), results, strict=True)):
         if split not in results[label]:
@@ -81,3 +113,60 @@ def _colors(results: Results) -> list[str]:
 
 def _mark(color: str, filled: bool, label: str) -> Line2D:
     return Line2D([], [], marker="o", ls="", ms=5, color=color, mfc=color if filled else "white", mew=1.3, label=label)
+
+
+def _row(
+    axes: Sequence[Axes], lines: Sequence[Line], zero_motion: Mapping[str, float] | None, by: str, window: int
+) -> None:
+    stages = [[line for line in lines if line["stage"] == name] for name in ("matching", "tracking")]
+    _curve(axes[0], stages[0], "right", by, window, INK)
+    _curve(axes[1], stages[1], "loss", by, window, INK)
+    for name, (label, color) in _SERIES.items():
+        _curve(axes[2], stages[1], name, by, window, color, label)
+        _held_out(axes[2], stages[1], name.replace("apd", "APD3D_none"), by, zero_motion or {}, color)
+    titles = (
+        "the encoder learns to match",
+        "the tracker learns to track",
+        "bold: examples · dots: held out · dashed: zero motion",
+    )
+    labels = "right within 1.5 cells", "loss", "APD3D"
+    for ax, title, label in zip(axes, titles, labels, strict=True):
+        label_axes(ax, label, by)
+        ax.set_title(title, fontsize=8, color=INK)
+    if stages[1] and not stages[0]:
+        axes[0].text(0.5, 0.5, "as it was", ha="center", color=INK, fontsize=8, transform=axes[0].transAxes)
+        axes[0].set(xticks=[], yticks=[])
+    axes[0].set_ylim(0, 1)
+    axes[2].set_ylim(0, 1)
+    if stages[1]:
+        axes[1].set_yscale("log")
+        axes[1].tick_params(which="minor", labelsize=7)
+        axes[2].legend(fontsize=7, frameon=False, loc="upper left")
+
+
+def _curve(
+    ax: Axes, lines: Sequence[Line], name: str, by: str, window: int, color: str, label: str | None = None
+) -> None:
+    known = [line for line in lines if line.get(name) is not None]
+    if not known:
+        return
+    x, y = _axis(known, by), np.array([line[name] for line in known])
+    sums = np.concatenate([[0.0], np.cumsum(y)])
+    stops = np.arange(1, len(y) + 1)
+    starts = np.maximum(stops - window, 0)
+    ax.plot(x, y, color=color, lw=0.4, alpha=0.25)
+    ax.plot(x, (sums[stops] - sums[starts]) / (stops - starts), color=color, lw=1.8, label=label)
+
+
+def _held_out(
+    ax: Axes, lines: Sequence[Line], name: str, by: str, zero_motion: Mapping[str, float], color: str
+) -> None:
+    scored = [line for line in lines if f"val_{name}" in line]
+    values = [line[f"val_{name}"] for line in scored]
+    ax.plot(_axis(scored, by), values, "o", color=color, ms=5, mec="white", mew=0.6)
+    if name in zero_motion:
+        ax.axhline(zero_motion[name], color=color, lw=1, ls="--")
+
+
+def _axis(lines: Sequence[Line], by: str) -> np.ndarray:
+    return np.array([line["step"] if by == "step" else line["seconds"] / 60 for line in lines])

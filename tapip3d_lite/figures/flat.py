@@ -14,6 +14,7 @@ from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project
 
 INK = "#30343b"
+STILL, MOVING = "#2b6cb0", "#d1495b"  # points at rest, points on moving bodies
 
 
 def track_colors(clip: Clip, tracks: Tracks) -> np.ndarray:
@@ -55,7 +56,7 @@ def frame_with_tracks(
     """
     check_drawable(clip, tracks, frame)
     ax = ax or _axes(clip)
-    _image(ax, clip.video[frame], f"{clip.name} · frame {frame}")
+    draw_image(ax, clip.video[frame], f"{clip.name} · frame {frame}")
     start = max(0, frame - tail)
     span = slice(start, frame + 1)
     uv, z = project(tracks.xyz[span], clip.intrinsics[span], clip.extrinsics[span])
@@ -79,7 +80,7 @@ def depth_map(clip: Clip, frame: int, ax: Axes | None = None) -> Figure:
     ax = ax or _axes(clip, extra=0.9)
     depth = clip.depths[frame]
     image = _depth(ax, depth, np.quantile(depth[depth > 0], [0, 0.99]) if depth.any() else (0, 1))
-    _frame(ax, f"{clip.name} · depth, frame {frame}")
+    _bare(ax, f"{clip.name} · depth, frame {frame}")
     _depth_bar(ax.figure, image, [ax])
     return ax.figure
 
@@ -93,7 +94,7 @@ def contact_sheet(clips: Clip | Sequence[Clip], frames: int = 6, width: float = 
         for column, t in enumerate(np.linspace(0, len(clip) - 1, frames).astype(int)):
             ax = figure.add_subplot(len(clips), frames, row * frames + column + 1)
             title = f"t = {t}" if row == 0 else ""
-            _image(ax, clip.video[t], title)
+            draw_image(ax, clip.video[t], title)
             if column == 0:
                 ax.set_ylabel(clip.name, fontsize=8, color=INK)
     return figure
@@ -114,7 +115,7 @@ def tracks_over_time(
         ax = figure.add_subplot(1, len(labels), i + 1)
         for name, curve in curves.items():
             ax.plot(curve[:, i], label=name, lw=1.6)
-        _plot(ax, f"{label} ({unit})", "frame")
+        label_axes(ax, f"{label} ({unit})", "frame")
     figure.axes[0].legend(fontsize=7, frameon=False)
     return figure
 
@@ -135,7 +136,7 @@ def scores_bar(scores: Mapping[str, Mapping[str, float]], metrics: Sequence[str]
         ax.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
     ax.set_xticks(range(len(metrics)), metrics)
     ax.set_ylim(0, 1.1)
-    _plot(ax, "score", "")
+    label_axes(ax, "score", "")
     ax.legend(fontsize=7, frameon=False, ncols=len(scores), loc="upper center", bbox_to_anchor=(0.5, 1.18))
     return figure
 
@@ -150,7 +151,7 @@ def overview(clip: Clip, tracks: Tracks, columns: int = 4) -> Figure:
     for (above, below), t in zip(axes.T, np.linspace(0, len(clip) - 1, columns).astype(int), strict=True):
         frame_with_tracks(clip, tracks, t, ax=above)
         image = _depth(below, clip.depths[t], limits)
-        _frame(below, "")
+        _bare(below, "")
     _depth_bar(figure, image, list(axes[1]))
     return figure
 
@@ -175,16 +176,17 @@ def _axes(clip: Clip, side: float = 3.4, extra: float = 0.0) -> Axes:
     return _figure(side + extra, side * height / width + 0.25).add_subplot()
 
 
-def _image(ax: Axes, image: np.ndarray, title: str) -> None:
+def draw_image(ax: Axes, image: np.ndarray, title: str) -> None:
+    """Draw an image (H, W, ...) with pixel centres at whole numbers and limits that stay when points are added."""
     ax.imshow(image)
     height, width = image.shape[:2]
     ax.set_xlim(-0.5, width - 0.5)
     ax.set_ylim(height - 0.5, -0.5)
     ax.set_autoscale_on(False)
-    _frame(ax, title)
+    _bare(ax, title)
 
 
-def _frame(ax: Axes, title: str) -> None:
+def _bare(ax: Axes, title: str) -> None:
     ax.set_xticks([])
     ax.set_yticks([])
     ax.set_title(title, fontsize=8, color=INK)
@@ -192,7 +194,8 @@ def _frame(ax: Axes, title: str) -> None:
         side.set_visible(False)
 
 
-def _plot(ax: Axes, vertical: str, horizontal: str) -> None:
+def label_axes(ax: Axes, vertical: str, horizontal: str) -> None:
+    """Give axes their labels and the look that all curves share."""
     ax.set_ylabel(vertical, fontsize=8)
     ax.set_xlabel(horizontal, fontsize=8)
     ax.tick_params(labelsize=7)

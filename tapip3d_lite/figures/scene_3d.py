@@ -74,7 +74,7 @@ def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = 
     colors = track_colors(clip, tracks)
     figure = Figure(figsize=(3.4 * len(frames), 2.6), layout="constrained")
     upright = _upright(clip)
-    limits = _limits(transform(np.concatenate([_cloud_points(clip, t, 800, near)[0] for t in frames]), upright))
+    limits = axis_limits(transform(np.concatenate([_cloud_points(clip, t, 800, near)[0] for t in frames]), upright))
     for i, t in enumerate(frames):
         ax = figure.add_subplot(1, len(frames), i + 1, projection="3d", computed_zorder=False)
         xyz, rgb = _cloud_points(clip, t, points, near)
@@ -165,7 +165,8 @@ def _color_scale(colors: np.ndarray) -> list:
     return scale if len(scale) > 1 else [[0, scale[0][1]], [1, scale[0][1]]]
 
 
-def _limits(xyz: np.ndarray) -> np.ndarray:
+def axis_limits(xyz: np.ndarray) -> np.ndarray:
+    """Limits (3, 2) of the axes around points (P, 3), with a margin and without the few farthest; NaN is left out."""
     low, high = np.nanquantile(xyz, [0.002, 0.998], axis=0)
     return np.stack([low, high], -1) + 0.03 * (high - low).max() * np.array([-1, 1])
 
@@ -173,7 +174,7 @@ def _limits(xyz: np.ndarray) -> np.ndarray:
 def _scene(clip: Clip, tracks: Tracks, near: float) -> dict[str, object]:
     steps = np.linspace(0, len(clip) - 1, min(len(clip), 6)).astype(int)
     cloud = np.concatenate([_cloud_points(clip, t, 800, near)[0] for t in steps])
-    ranges = _limits(np.concatenate([cloud, tracks.xyz[steps].reshape(-1, 3)]))
+    ranges = axis_limits(np.concatenate([cloud, tracks.xyz[steps].reshape(-1, 3)]))
     axis = {"showspikes": False, "title": {"font": {"size": 10}}, "tickfont": {"size": 9}, "backgroundcolor": "#f4f5f7"}
     axes = {f"{k}axis": axis | {"range": r.tolist(), "autorange": False} for k, r in zip("xyz", ranges, strict=True)}
     return axes | {"aspectmode": "data", "camera": _camera(clip, np.median(cloud, axis=0), ranges)}
@@ -207,20 +208,19 @@ def _upright(clip: Clip) -> np.ndarray:
     return pose
 
 
-def _step_args(duration: int, mode: str) -> dict[str, object]:
-    return {"mode": mode, "frame": {"duration": duration, "redraw": True}, "transition": {"duration": 0}}
+def animation_args(duration: int) -> dict[str, object]:
+    """What a slider's step or a play button asks of plotly: show each frame for `duration` ms, redraw it, no transition."""
+    return {"mode": "immediate", "frame": {"duration": duration, "redraw": True}, "transition": {"duration": 0}}
 
 
 def _slider(frames: int) -> dict[str, object]:
-    steps = [
-        {"label": str(t), "method": "animate", "args": [[str(t)], _step_args(0, "immediate")]} for t in range(frames)
-    ]
+    steps = [{"label": str(t), "method": "animate", "args": [[str(t)], animation_args(0)]} for t in range(frames)]
     return {"steps": steps, "currentvalue": {"prefix": "frame "}, "x": 0.17, "len": 0.81, "pad": {"t": 4, "b": 24}}
 
 
 def _play_button() -> dict[str, object]:
-    play = {"label": "play", "method": "animate", "args": [None, _step_args(120, "immediate") | {"fromcurrent": True}]}
-    pause = {"label": "pause", "method": "animate", "args": [[None], _step_args(0, "immediate")]}
+    play = {"label": "play", "method": "animate", "args": [None, animation_args(120) | {"fromcurrent": True}]}
+    pause = {"label": "pause", "method": "animate", "args": [[None], animation_args(0)]}
     return {
         "type": "buttons",
         "buttons": [play, pause],

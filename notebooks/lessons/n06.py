@@ -1,11 +1,10 @@
-"""Watching a tracker learn: learning curves, a live picture with a stop button, and learnt tracks beside the truth."""
+"""Lesson 06: watching a tracker learn, a live picture with a stop button, and learnt tracks beside the truth."""
 
 from __future__ import annotations
 
 import asyncio
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import ipywidgets as widgets
 import numpy as np
@@ -13,91 +12,42 @@ from IPython.display import display
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lessons.n02_figures import MOVING, STILL
+from lessons.checker import check, score_guess
+from lessons.n06_augmentations import before_and_after, motion_paths
+from lessons.n06_chain import Chain
+from lessons.n06_exercises import EXERCISES
+from lessons.widgets import explore
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures import png_bytes
-from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
+from tapip3d_lite.figures.curves import Line, learning_curves
+from tapip3d_lite.figures.flat import MOVING, STILL, check_drawable, draw_image
 from tapip3d_lite.geometry import project
 from tapip3d_lite.lab.train import interruptible
 from tapip3d_lite.training.journal import read_log
 from tapip3d_lite.training.trainer import Trainer
 
-Line = Mapping[str, Any]
-_SERIES = {"apd": ("all points", STILL), "apd_dynamic": ("moving points", MOVING)}
+__all__ = [
+    "EXERCISES",
+    "Chain",
+    "before_and_after",
+    "check",
+    "explore",
+    "learning_curve",
+    "motion_paths",
+    "score_guess",
+    "tracks_and_truth",
+    "train_live",
+]
 
 
-def learning_curve(
-    lines: Sequence[Line], zero_motion: Mapping[str, float] | None = None, by: str = "step", window: int = 100
-) -> Figure:
-    """How a training went: matching of the encoder, loss, and APD3D on examples (lines) and held-out clips (dots).
+def learning_curve(lines: Sequence[Line], zero_motion: Mapping[str, float] | None = None) -> Figure:
+    """The learning curves of one training, from the lines of its log so far.
 
     Args:
-        lines: of the log, from `read_log` or collected by `Trainer.run(watch=...)`; may be empty.
+        lines: of the log; may be empty.
         zero_motion: scores of zero motion on the held-out clips, drawn dashed: `APD3D_none`, `APD3D_none_dynamic`.
-        by: horizontal axis, `"step"` or `"minutes"` of training.
-        window: steps over which the bold lines are averaged; the raw values stay behind them.
-
-    Raises:
-        ValueError: another `by`, or a window of no step.
     """
-    return learning_curves([("", lines)], zero_motion, by, window)
-
-
-def learning_curves(
-    logs: Sequence[tuple[str, Sequence[Line]]],
-    zero_motion: Mapping[str, float] | None = None,
-    by: str = "step",
-    window: int = 100,
-) -> Figure:
-    """The learning curves of several trainings, one row each.
-
-    Args:
-        logs: (name, lines) of each training.
-        zero_motion: see `learning_curve`; of all of them.
-        by: see `learning_curve`.
-        window: see `learning_curve`.
-
-    Raises:
-        ValueError: as `learning_curve`.
-    """
-    if by not in ("step", "minutes") or window < 1:
-        raise ValueError(f'learning_curve: expected by="step" or "minutes", window >= 1, got {by!r}, {window}')
-    figure = Figure(figsize=(11, 2.9 * len(logs)), layout="constrained")
-    rows = figure.subplots(len(logs), 3, squeeze=False)
-    for axes, (name, lines) in zip(rows, logs, strict=True):
-        _row(axes, lines, zero_motion, by, window)
-        if name:
-            axes[0].set_ylabel(f"{name}\n\n{axes[0].get_ylabel()}", fontsize=8)
-    return figure
-
-
-def _row(
-    axes: Sequence[Axes], lines: Sequence[Line], zero_motion: Mapping[str, float] | None, by: str, window: int
-) -> None:
-    stages = [[line for line in lines if line["stage"] == name] for name in ("matching", "tracking")]
-    _curve(axes[0], stages[0], "right", by, window, INK)
-    _curve(axes[1], stages[1], "loss", by, window, INK)
-    for name, (label, color) in _SERIES.items():
-        _curve(axes[2], stages[1], name, by, window, color, label)
-        _held_out(axes[2], stages[1], name.replace("apd", "APD3D_none"), by, zero_motion or {}, color)
-    titles = (
-        "the encoder learns to match",
-        "the tracker learns to track",
-        "bold: examples · dots: held out · dashed: zero motion",
-    )
-    labels = "right within 1.5 cells", "loss", "APD3D"
-    for ax, title, label in zip(axes, titles, labels, strict=True):
-        _plot(ax, label, by)
-        ax.set_title(title, fontsize=8, color=INK)
-    if stages[1] and not stages[0]:
-        axes[0].text(0.5, 0.5, "as it was", ha="center", color=INK, fontsize=8, transform=axes[0].transAxes)
-        axes[0].set(xticks=[], yticks=[])
-    axes[0].set_ylim(0, 1)
-    axes[2].set_ylim(0, 1)
-    if stages[1]:
-        axes[1].set_yscale("log")
-        axes[1].tick_params(which="minor", labelsize=7)
-        axes[2].legend(fontsize=7, frameon=False, loc="upper left")
+    return learning_curves([("", lines)], zero_motion)
 
 
 def tracks_and_truth(clip: Clip, pred: Tracks, frames: Sequence[int] | None = None) -> Figure:
@@ -120,7 +70,7 @@ def tracks_and_truth(clip: Clip, pred: Tracks, frames: Sequence[int] | None = No
     for column, t in enumerate(frames):
         check_drawable(clip, frame=t)
         for ax, tracks, word in ((axes[0, column], clip.tracks, "truth"), (axes[1, column], pred, "learnt")):
-            _image(ax, clip.video[t], f"{word} · frame {t}")
+            draw_image(ax, clip.video[t], f"{word} · frame {t}")
             _moves(ax, clip, tracks, t, clip.tracks if tracks is pred else None)
     return figure
 
@@ -138,7 +88,7 @@ class LivePlot:
 
         Args:
             lines: of the log so far.
-            zero_motion: see `learning_curve`.
+            zero_motion: scores of zero motion, drawn dashed.
         """
         self.lines, self.zero_motion = list(lines), zero_motion
         self._pressed, self._begun = False, time.monotonic()
@@ -150,7 +100,7 @@ class LivePlot:
         self.draw()
 
     def press(self) -> None:
-        """What the button does."""
+        """Stop the training after its present step, as the button does."""
         self._pressed = True
         self.button.disabled = True
 
@@ -179,14 +129,14 @@ async def train_live(
     Args:
         trainer: as it stands.
         minutes: at most, of wall-clock time.
-        zero_motion: see `learning_curve`.
+        zero_motion: scores of zero motion, drawn dashed.
         every: seconds between two drawings, at least; more where drawing would take more than a twentieth of the time.
 
     Returns:
         All lines of the log.
 
     Raises:
-        FloatingPointError: see `Trainer.run`.
+        FloatingPointError: the loss is not finite; the trainer has saved the batch.
     """
     log = trainer.journal.folder / "log.jsonl"
     live = LivePlot(read_log(log) if log.exists() else (), zero_motion)
@@ -206,34 +156,6 @@ async def train_live(
         live.button.disabled = True
         live.draw()
     return live.lines
-
-
-def _curve(
-    ax: Axes, lines: Sequence[Line], name: str, by: str, window: int, color: str, label: str | None = None
-) -> None:
-    known = [line for line in lines if line.get(name) is not None]
-    if not known:
-        return
-    x, y = _axis(known, by), np.array([line[name] for line in known])
-    sums = np.concatenate([[0.0], np.cumsum(y)])
-    stops = np.arange(1, len(y) + 1)
-    starts = np.maximum(stops - window, 0)
-    ax.plot(x, y, color=color, lw=0.4, alpha=0.25)
-    ax.plot(x, (sums[stops] - sums[starts]) / (stops - starts), color=color, lw=1.8, label=label)
-
-
-def _held_out(
-    ax: Axes, lines: Sequence[Line], name: str, by: str, zero_motion: Mapping[str, float], color: str
-) -> None:
-    scored = [line for line in lines if f"val_{name}" in line]
-    values = [line[f"val_{name}"] for line in scored]
-    ax.plot(_axis(scored, by), values, "o", color=color, ms=5, mec="white", mew=0.6)
-    if name in zero_motion:
-        ax.axhline(zero_motion[name], color=color, lw=1, ls="--")
-
-
-def _axis(lines: Sequence[Line], by: str) -> np.ndarray:
-    return np.array([line["step"] if by == "step" else line["seconds"] / 60 for line in lines])
 
 
 def _moves(ax: Axes, clip: Clip, tracks: Tracks, t: int, truth: Tracks | None) -> None:

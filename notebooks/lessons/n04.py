@@ -1,4 +1,4 @@
-"""Figures of notebook 04: the waves of an offset, two bags in two images, and who looks at whom."""
+"""Lesson 04: the waves of an offset, two bags in two images, and who looks at whom."""
 
 from __future__ import annotations
 
@@ -12,11 +12,32 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from matplotlib.ticker import ScalarFormatter
 
+from lessons.checker import check, score_guess
+from lessons.n04_exercises import EXERCISES
+from lessons.n04_votes import paired_bags, similarity_attention, votes
+from lessons.widgets import explore
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
+from tapip3d_lite.figures.flat import INK, check_drawable, draw_image, label_axes
 from tapip3d_lite.geometry import project
 from tapip3d_lite.model.blocks import DEGREES, fourier
 from tapip3d_lite.recorder import LevelRecord, StepRecord
+
+__all__ = [
+    "EXERCISES",
+    "WAYS",
+    "AttentionPair",
+    "check",
+    "entropy",
+    "explore",
+    "fourier_waves",
+    "paired_bags",
+    "rates",
+    "score_guess",
+    "similarity_attention",
+    "two_bags",
+    "votes",
+    "who_looks_where",
+]
 
 OWN, SUPPORT, CONTEXT = "#e8a33d", "#2b6cb0", "#d1495b"
 WAYS = ("support looks at context", "context looks at support")
@@ -43,7 +64,7 @@ def fourier_waves(reach: float = 1.0, samples: int = 400) -> Figure:
         extent=(0, reach, DEGREES[-1] + 0.5, DEGREES[0] - 0.5),
     )
     left.set_title("sin(2^j x), one row a degree j", fontsize=9, color=INK)
-    _plot(left, "degree j", "offset x (normalised)")
+    label_axes(left, "degree j", "offset x (normalised)")
     left.grid(False)
     figure.colorbar(image, ax=left, fraction=0.04, pad=0.02).ax.tick_params(labelsize=7)
     distance = np.geomspace(1e-5, 10, samples * fine)
@@ -53,7 +74,7 @@ def fourier_waves(reach: float = 1.0, samples: int = 400) -> Figure:
         alike = np.cos(2.0**degrees * distance[:, None]).mean(-1).reshape(samples, fine).mean(1)
         right.semilogx(distance[::fine], alike, label=f"degrees {low} to {high}")
     right.set_title("likeness of two embeddings", fontsize=9, color=INK)
-    _plot(right, "mean of cos(2^j distance)", "distance (normalised)")
+    label_axes(right, "mean of cos(2^j distance)", "distance (normalised)")
     right.legend(fontsize=7, frameon=False)
     return figure
 
@@ -66,7 +87,7 @@ def cell_centers(indices: np.ndarray, grid: tuple[int, int], size: tuple[int, in
 
 
 @dataclass(frozen=True)
-class Pair:
+class AttentionPair:
     """Two neighbourhoods of one track in the last update of a window: what `two_bags` and `who_looks_where` draw.
 
     Attributes:
@@ -97,7 +118,7 @@ class Pair:
         track: int = 0,
         frame: int = 0,
         level: int = 0,
-    ) -> Pair:
+    ) -> AttentionPair:
         """Find a track, frame and level in a forward pass that was recorded.
 
         Args:
@@ -142,7 +163,7 @@ class Pair:
         return looks[self.row, self.column].numpy()
 
 
-def two_bags(pair: Pair) -> Figure:
+def two_bags(pair: AttentionPair) -> Figure:
     """The cells of both bags in their images, and both bags of offsets over each other, seen along the world's y."""
     figure = Figure(figsize=(9.6, 3.2), layout="constrained")
     *images, ax = figure.subplots(1, 3)
@@ -157,14 +178,14 @@ def two_bags(pair: Pair) -> Figure:
     for offsets, color, name in zip(bags, (SUPPORT, CONTEXT), ("support", "context"), strict=True):
         ax.scatter(*offsets[:, [0, 2]].numpy().T, s=22, color=color, label=name, alpha=0.8, linewidths=0)
     ax.scatter(0, 0, label="the point", **star)
-    _plot(ax, "offset in z", "offset in x")
+    label_axes(ax, "offset in z", "offset in x")
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_title("offsets (normalised)", fontsize=8, color=INK)
     ax.legend(fontsize=7, frameon=False)
     return figure
 
 
-def who_looks_where(pair: Pair, token: int = 0, way: str = WAYS[0]) -> Figure:
+def who_looks_where(pair: AttentionPair, token: int = 0, way: str = WAYS[0]) -> Figure:
     """One token's attention as lines between two images, and the whole matrix beside them.
 
     Args:
@@ -193,7 +214,7 @@ def who_looks_where(pair: Pair, token: int = 0, way: str = WAYS[0]) -> Figure:
     matrix.axhline(token, color=OWN, lw=1.2)
     bits = f"token {token}: entropy {entropy(weights[token]):.2f} of {np.log2(weights.shape[1]):.2f} bits"
     matrix.set_title(f"{way}\n{bits}", fontsize=8, color=INK)
-    _plot(matrix, "token that looks", "token that is seen")
+    label_axes(matrix, "token that looks", "token that is seen")
     matrix.grid(False)
     figure.colorbar(image, ax=matrix, fraction=0.045, pad=0.02).ax.tick_params(labelsize=7)
     return figure
@@ -219,7 +240,7 @@ def rates(panels: Mapping[str, Mapping[str, tuple[Sequence[float], np.ndarray]]]
             error = 1.96 * y.std(0, ddof=1) / np.sqrt(len(y)) if len(y) > 1 else None
             style = "--" if name.startswith("chance") else "-"
             ax.errorbar(x, y.mean(0), error, label=name, color=f"C{i}", lw=1.6, ls=style, marker="o", ms=3, capsize=2)
-        _plot(ax, ylabel, xlabel)
+        label_axes(ax, ylabel, xlabel)
         ax.set_title(title, fontsize=9, color=INK)
         ax.set_xscale("log", base=2)
         ax.xaxis.set_major_formatter(ScalarFormatter())
@@ -229,7 +250,7 @@ def rates(panels: Mapping[str, Mapping[str, tuple[Sequence[float], np.ndarray]]]
 
 def _crop(ax: Axes, clip: Clip, frame: int, places: np.ndarray, title: str, margin: float = 7) -> None:
     """A frame, cut to a square around places (n, 2)."""
-    _image(ax, clip.video[frame], title)
+    draw_image(ax, clip.video[frame], title)
     low, high = places.min(0), places.max(0)
     half = (high - low).max() / 2 + margin
     (u, v) = (low + high) / 2

@@ -1,4 +1,4 @@
-"""Figures of motion in different coordinate spaces: whole paths side by side, and one path with its best simple fit."""
+"""Lesson 02: paths side by side in different coordinate spaces, and one path with its best simple fit."""
 
 from __future__ import annotations
 
@@ -6,11 +6,28 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lessons.n02_straightness import bend, fit_windows, to_space
+from lessons.checker import check, score_guess
+from lessons.n02_exercises import EXERCISES
+from lessons.n02_straightness import SPACES, bend, fit_windows, stays_in_view, to_space
+from lessons.widgets import explore
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.figures.flat import INK, _image, _plot
+from tapip3d_lite.figures.flat import INK, MOVING, STILL, draw_image, label_axes
 
-STILL, MOVING, FIT = "#2b6cb0", "#d1495b", "#e8a33d"
+__all__ = [
+    "EXERCISES",
+    "SPACES",
+    "bend",
+    "check",
+    "explore",
+    "fit_windows",
+    "motion_fit",
+    "paths_in_spaces",
+    "score_guess",
+    "stays_in_view",
+    "to_space",
+]
+
+FIT = "#e8a33d"
 LABELS = {
     "uvd": ("u (px)", "v (px)", "depth"),
     "uvlogd": ("u (px)", "v (px)", "f log d (px)"),
@@ -29,7 +46,7 @@ def paths_in_spaces(clip: Clip, still: np.ndarray, moving: np.ndarray) -> Figure
     """
     figure = Figure(figsize=(10.2, 3.2), layout="constrained")
     axes = figure.subplots(1, 3)
-    _image(axes[0], clip.video[-1], "image: u, v")
+    draw_image(axes[0], clip.video[-1], "image: u, v")
     views = (("uvd", (0, 1)), ("camera", (0, 2)), ("world", (0, 1)))
     for ax, (space, pair) in zip(axes, views, strict=True):
         coords = to_space(clip.tracks.xyz, clip.intrinsics, clip.extrinsics, space)
@@ -39,7 +56,7 @@ def paths_in_spaces(clip: Clip, still: np.ndarray, moving: np.ndarray) -> Figure
                 ax.plot(*path.T, color=color, lw=1.3)
                 ax.plot(*path[-1], "o", color=color, ms=3.5, mec="white", mew=0.4)
         if space != "uvd":
-            _plot(ax, f"{LABELS[space][pair[1]]} (m)", f"{LABELS[space][pair[0]]} (m)")
+            label_axes(ax, f"{LABELS[space][pair[1]]} (m)", f"{LABELS[space][pair[0]]} (m)")
             ax.set_aspect("equal", adjustable="datalim")
             ax.set_title(f"{space}, from above", fontsize=8, color=INK)
     return figure
@@ -65,13 +82,13 @@ def motion_fit(
     error = bend(xyz, clip.intrinsics, clip.extrinsics, space, window, degree)[start, 0]
     figure = Figure(figsize=(10.2, 2.5), layout="constrained")
     axes = figure.subplots(1, 4)
-    _image(axes[0], clip.video[start], f"{clip.name} · frame {start}")
+    draw_image(axes[0], clip.video[start], f"{clip.name} · frame {start}")
     _mark(axes[0], clip, track, start)
     for i, ax in enumerate(axes[1:]):
         ax.axvspan(start, start + window - 1, color="#000", alpha=0.06, lw=0)
         ax.plot(coords[:, i], ".-", color=STILL, lw=1, ms=4, label="truth")
         ax.plot(np.arange(start, start + window), fit[:, i], "--", color=FIT, lw=2, label=f"fit, degree {degree}")
-        _plot(ax, LABELS[space][i], "frame")
+        label_axes(ax, LABELS[space][i], "frame")
         _widen(ax, 0.2 if LABELS[space][i] in (*LABELS["camera"], *LABELS["world"], "depth") else 3.0)
     axes[1].legend(fontsize=7, frameon=False)
     axes[2].set_title(f"{space}: the fit misses the truth by {100 * error:.1f} cm (RMS)", fontsize=9, color=INK)

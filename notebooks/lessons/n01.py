@@ -1,4 +1,4 @@
-"""Exercises of notebook 01: from RGB-D to point maps and feature clouds."""
+"""Lesson 01, its exercises: from RGB-D to point maps and feature clouds."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lessons.checker import Exercise, Mistake
+from lessons.checker import Exercise, Mistake, check, score_guess
+from lessons.widgets import explore
 from tapip3d_lite.geometry import invert, resize_intrinsics, transform, unproject
+
+__all__ = ["EXERCISES", "check", "explore", "random_extrinsics", "random_intrinsics", "score_guess"]
 
 Array = np.ndarray
 

@@ -1,6 +1,6 @@
 """What a neighbourhood knows that a point does not, before any training: two bags of cells vote for where a point went.
 
-Paper: section 3.3 (neighbourhood to neighbourhood) and table 7 (against point to neighbourhood). If support token i
+Paper: section 3.2 (neighbourhood to neighbourhood) and the table on N2N (against point to neighbourhood). If support token i
 looks at context token m, then it believes in the displacement that carries i to m. A context cell j wins if many
 tokens believe in the displacement that carries the point to j. A point alone is a bag with one token.
 """
@@ -45,7 +45,7 @@ def paired_bags(
     """Bags of tracked points, `step` frames apart.
 
     The estimate is put on a random one of the K cells around the truth, so that the right cell can stand anywhere in
-    the context and guessing the middle one is worth no more than chance, 1 / K.
+    the context and guessing the middle one is right in 1 / K of the cases.
 
     Args:
         clip: T frames with true tracks.

@@ -1,23 +1,46 @@
-"""Figures of notebook 05: the token's parts, windows, a trajectory that converges, and a tracker with a part removed."""
+"""Lesson 05: the token's parts, windows, a trajectory that converges, and a tracker with a part removed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from statistics import median
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from lessons.n05_exercises import hand_over
+from lessons.checker import check, score_guess
+from lessons.n05_exercises import EXERCISES, hand_over
+from lessons.widgets import explore
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
+from tapip3d_lite.figures.flat import INK, check_drawable, draw_image, label_axes
 from tapip3d_lite.geometry import project
 from tapip3d_lite.model.blocks import FACTOR, fourier
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.frames import frames_from_clip
+from tapip3d_lite.model.tracker import Tracker
+
+__all__ = [
+    "EXERCISES",
+    "check",
+    "converging",
+    "explore",
+    "film",
+    "paired",
+    "random_tracker",
+    "score_guess",
+    "time_in_turns",
+    "time_ratios",
+    "token_bar",
+    "token_parts",
+    "windows_chart",
+    "without",
+]
 
 ESTIMATE, TRUTH = "#e8a33d", "#2b6cb0"
 PARTS = ("motion", "virtual tracks")
@@ -38,7 +61,7 @@ def token_bar(parts: Mapping[str, int]) -> Figure:
         ax.barh(0, width, left=start, color=f"C{i}", label=f"{name}: {width}", edgecolor="white")
         start += width
     ax.set_title(f"trajectory token: {start} channels", fontsize=9, color=INK)
-    _plot(ax, "", "channel")
+    label_axes(ax, "", "channel")
     ax.set_yticks([])
     ax.set_xlim(0, start)
     figure.legend(*ax.get_legend_handles_labels(), ncols=4, fontsize=7, frameon=False, loc="outside lower center")
@@ -64,7 +87,7 @@ def windows_chart(frames: int, window: int, starts: Sequence[int], times: Sequen
     ax.axvline(frames - 0.5, color=INK, ls="--", lw=1)
     ax.set_yticks(range(len(starts)))
     ax.invert_yaxis()
-    _plot(ax, "window", "frame (dashed: the clip's end)")
+    label_axes(ax, "window", "frame (dashed: the clip's end)")
     return figure
 
 
@@ -95,7 +118,7 @@ class Film:
         return np.linalg.norm(path[:, : len(truth)] - truth, axis=-1)
 
     def path(self, window: int, track: int) -> np.ndarray:
-        """(M + 1, S, 3); `ValueError` where the window does not contain the track."""
+        """Estimates (M + 1, S, 3) of one track; `ValueError` where the window does not contain the track."""
         if not 0 <= window < len(self.starts) or track not in self.columns[window]:
             raise ValueError(f"window: expected one with track {track}, got {window}; take a later one")
         return self.xyz[window][:, :, list(self.columns[window]).index(track)]
@@ -151,13 +174,13 @@ def converging(clip: Clip, shown: Film, track: int = 0, window: int = 0, iterati
     check_drawable(clip, frame=last)
     figure = Figure(figsize=(9.8, 3.0), layout="constrained")
     image, top, error = figure.subplots(1, 3)
-    _image(image, clip.video[last], f"frame {last}, track {track}")
+    draw_image(image, clip.video[last], f"frame {last}, track {track}")
     truth, now = shown.truth[span, track], path[iteration, : errors.shape[1]]
     for xyz, color, name in ((truth, TRUTH, "truth"), (now, ESTIMATE, f"after {iteration} updates")):
         uv, _ = project(xyz[:, None], clip.intrinsics[span], clip.extrinsics[span])  # each frame by its camera
         image.plot(*uv[:, 0].T, ".-", color=color, lw=1.5, ms=4)
         top.plot(*xyz[:, :2].T, ".-", color=color, lw=1.5, ms=5, label=name)
-    _plot(top, "y (m)", "x (m)")
+    label_axes(top, "y (m)", "x (m)")
     everything = np.concatenate([path[:, : len(truth)].reshape(-1, 3), truth])[:, :2]
     middle, reach = (everything.min(0) + everything.max(0)) / 2, np.ptp(everything, axis=0).max() / 2 * 1.1 + 1e-3
     top.set_xlim(middle[0] - reach, middle[0] + reach)
@@ -171,7 +194,7 @@ def converging(clip: Clip, shown: Film, track: int = 0, window: int = 0, iterati
         error.plot(range(*span.indices(len(clip))), 100 * errors[i], ".-", color=ESTIMATE, alpha=strength)
     error.set_ylim(0, 105 * errors.max() + 1e-3)
     error.set_title(f"mean {100 * errors[iteration].mean():.1f} cm", fontsize=8, color=INK)
-    _plot(error, "error (cm)", "frame")
+    label_axes(error, "error (cm)", "frame")
     return figure
 
 
@@ -184,7 +207,7 @@ def paired(differences: Mapping[str, np.ndarray], xlabel: str) -> Figure:
         ax.plot(values, [row] * len(values), "o", color=TRUTH, alpha=0.4, ms=4)
         ax.errorbar(np.mean(values), row, xerr=error, fmt="D", color=INK, ms=5, capsize=3)
     ax.axvline(0, color=INK, lw=0.8, ls="--")
-    _plot(ax, "", xlabel)
+    label_axes(ax, "", xlabel)
     ax.set_yticks(range(len(differences)), list(differences), fontsize=8)
     ax.set_ylim(len(differences) - 0.5, -0.5)
     return figure
@@ -196,7 +219,7 @@ def without(tracker: nn.Module, part: str) -> Iterator[nn.Module]:
 
     Args:
         tracker: with the updater `transformer`.
-        part: `"motion"`: every token says that the point stands still; `"virtual tracks"`: no track hears of others.
+        part: `"motion"`: every token says that the point stands still; `"virtual tracks"`: points read nothing from them.
 
     Raises:
         ValueError: no such part.
@@ -204,6 +227,7 @@ def without(tracker: nn.Module, part: str) -> Iterator[nn.Module]:
     if part not in PARTS:
         raise ValueError(f"part: expected one of {', '.join(PARTS)}; got {part!r}")
     if part == "motion":
+        # Here the hooks' values are the point: they take the place of what the parts are given, or return.
         handles = [tracker.updater.register_forward_pre_hook(lambda _, inputs: _still(tracker, *inputs))]
     else:
         handles = [block.register_forward_hook(lambda _, inputs, out: inputs[0]) for block in tracker.updater.scatter]
@@ -212,6 +236,35 @@ def without(tracker: nn.Module, part: str) -> Iterator[nn.Module]:
     finally:
         for handle in handles:
             handle.remove()
+
+
+def random_tracker(fast: bool, **changes: Any) -> Tracker:
+    """A `lite` tracker with changed settings and random weights, always the same ones: fast, or its clear form."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return Tracker(TrackerConfig.preset("lite", **changes), fast).eval()
+
+
+def time_in_turns(calls: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
+    """Seconds of functions, by name, that take turns: other work on the machine then slows all of them alike.
+
+    Args:
+        calls: the functions; each runs once before, unmeasured.
+        rounds: how often each is measured.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds + 1):
+        for name, call in calls.items():
+            start = perf_counter()
+            call()
+            seconds[name].append(perf_counter() - start)
+    return {name: times[1:] for name, times in seconds.items()}
+
+
+def time_ratios(slow: Sequence[float], fast: Sequence[float]) -> tuple[float, float, float]:
+    """(minimum, median, maximum) of how many times longer `slow` took than `fast`, round by round."""
+    values = [a / b for a, b in zip(slow, fast, strict=True)]
+    return min(values), median(values), max(values)
 
 
 def _still(tracker: nn.Module, tokens: Tensor, active: Tensor | None) -> tuple[Tensor, Tensor | None]:

@@ -1,12 +1,15 @@
-"""Exercises of notebook 00: queries from pixels, where a camera stands, visibility by depth, hits within a ball."""
+"""Lesson 00, its exercises: queries from pixels, where a camera stands, visibility by depth, hits within a ball."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from lessons.checker import Exercise, Mistake
-from lessons.n01_exercises import random_extrinsics, random_intrinsics
+from lessons.checker import Exercise, Mistake, check, score_guess
+from lessons.n01 import random_extrinsics, random_intrinsics
+from lessons.widgets import explore
 from tapip3d_lite.geometry import invert, transform, unproject
+
+__all__ = ["EXERCISES", "check", "explore", "score_guess"]
 
 Array = np.ndarray
 

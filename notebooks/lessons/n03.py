@@ -1,4 +1,4 @@
-"""Figures of notebook 03: two neighbourhoods in the image and in space, and shares of right neighbours."""
+"""Lesson 03: two neighbourhoods in the image and in space, and shares of right neighbours."""
 
 from __future__ import annotations
 
@@ -11,11 +11,35 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from lessons.n03_cells import Cells, track_objects
+from lessons.checker import check, score_guess
+from lessons.n02_straightness import to_space
+from lessons.n03_cells import Cells, silhouettes, track_objects
+from lessons.n03_exercises import EXERCISES, search, walls
+from lessons.samples import SAMPLES
+from lessons.widgets import explore
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.figures.flat import INK, _image, _plot, check_drawable
-from tapip3d_lite.figures.scene_3d import _limits, _step_args
+from tapip3d_lite.figures.flat import INK, check_drawable, draw_image, label_axes
+from tapip3d_lite.figures.scene_3d import animation_args, axis_limits
 from tapip3d_lite.geometry import project, transform, unproject
+
+__all__ = [
+    "EXERCISES",
+    "SAMPLES",
+    "Around",
+    "Cells",
+    "check",
+    "explore",
+    "neighborhoods_3d",
+    "proof_view",
+    "score_guess",
+    "search",
+    "share_curves",
+    "silhouettes",
+    "to_space",
+    "track_objects",
+    "two_neighborhoods",
+    "walls",
+]
 
 QUERY, RIGHT, WRONG = "#e8a33d", "#2b6cb0", "#d1495b"
 NAMES = {"window": "window in the image", "knn": "k-NN in 3D"}
@@ -63,11 +87,11 @@ class Around:
         return cls(clip, frame, cells, xyz[0], uv[0], bool(clip.tracks.visible[frame, track]), found, right)
 
     def points(self, kind: str) -> np.ndarray:
-        """(K, 3), camera frame."""
+        """The neighbours' points (K, 3), camera frame."""
         return transform(self.cells.points.reshape(-1, 3)[self.found[kind]], self.clip.extrinsics[self.frame])
 
     def pixels(self, kind: str) -> np.ndarray:
-        """(K, 2)."""
+        """The neighbours' pixels (K, 2)."""
         return self.cells.uv.reshape(-1, 2)[self.found[kind]]
 
     def surroundings(self, box: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +119,7 @@ def two_neighborhoods(
 
     Args:
         clip: with true tracks.
-        objects: (T, H, W), see `simulate.object_maps`.
+        objects: (T, H, W), from `simulate.object_maps`.
         track: whose true position in the frame is the query; hollow where it is hidden.
         frame: frame index.
         neighbors: K.
@@ -140,11 +164,11 @@ def neighborhoods_3d(
     ]
     fixed = [_markers(cloud, "scene", 3, colors), _markers(query, "query", 7, QUERY, symbol="diamond")]
     figure = go.Figure(data=[*fixed, *frames[0].data], frames=frames)
-    limits = _limits(np.concatenate([cloud, query, *(steps[-1].points(kind) for kind in NAMES)]))
+    limits = axis_limits(np.concatenate([cloud, query, *(steps[-1].points(kind) for kind in NAMES)]))
     axes = {f"{k}axis": {"range": r.tolist(), "autorange": False} for k, r in zip("xyz", limits, strict=True)}
     axes["yaxis"]["range"].reverse()  # the image's y points down
     view = {"up": {"x": 0, "y": 1, "z": 0}, "eye": {"x": -1.6, "y": 0.7, "z": -0.9}}
-    args = _step_args(0, "immediate")
+    args = animation_args(0)
     steps_of_k = [{"label": str(k), "method": "animate", "args": [[str(k)], args]} for k in counts]
     figure.update_layout(
         scene=axes | {"aspectmode": "data", "camera": view},
@@ -176,7 +200,7 @@ def share_curves(
             error = 1.96 * np.sqrt(np.nansum((values - mean) ** 2, 0) / np.maximum(clips - 1, 1) / clips)
             style = {"marker": "o", "ms": 3, "lw": 1.5, "capsize": 2, "color": f"C{i}"}
             ax.errorbar(np.arange(len(labels)) + 0.06 * i, mean, error, label=name, **style)
-        _plot(ax, ylabel if ax is axes[0] else "", xlabel)
+        label_axes(ax, ylabel if ax is axes[0] else "", xlabel)
         ax.set_xticks(range(len(labels)), labels, fontsize=7)
         ax.set_title(title, fontsize=9, color=INK)
     figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside right center")
@@ -213,13 +237,13 @@ def proof_view(
     ax.set_xlim(x - 1.6 * reach, x + 1.6 * reach)
     ax.set_ylim(z - reach, z + reach)
     ax.set_aspect("equal")
-    _plot(ax, "depth z (m)", "x (m)")
+    label_axes(ax, "depth z (m)", "x (m)")
     ax.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
 def _in_image(ax: Axes, around: Around, kind: str, box: tuple[float, ...], title: str) -> None:
-    _image(ax, around.clip.video[around.frame], title)
+    draw_image(ax, around.clip.video[around.frame], title)
     left, top, end, bottom = box
     ax.set_xlim(left - 0.5, end + 0.5)
     ax.set_ylim(bottom + 0.5, top - 0.5)
