@@ -17,28 +17,7 @@ CHOICES = {
     "norm_mode": ("isotropic", "anisotropy", "none"),
 }
 _SWITCHES = ("space", "neighborhood", "context", "updater")
-_POSITIVE = [
-    "window",
-    "feature_dim",
-    "stride",
-    "levels",
-    "neighbors",
-    "token_dim",
-    "context_heads",
-    "context_head_dim",
-    "offset_layers",
-    "offset_dim",
-    "hidden",
-    "heads",
-    "head_dim",
-    "time_depth",
-    "space_depth",
-    "iterations",
-    "norm_scale",
-    "context_mlp_ratio",
-    "mlp_ratio",
-    "virtual_tracks",
-]
+_MAY_BE_ZERO = ("support_grid", "visible_threshold")
 
 Part = str | Callable[..., Any]
 
@@ -128,9 +107,10 @@ class TrackerConfig:
             if value not in allowed if isinstance(value, str) else not (name in _SWITCHES and callable_part(value)):
                 own = ", or a custom part" if name in _SWITCHES else ""
                 raise ValueError(f"TrackerConfig.{name}: expected one of {', '.join(allowed)}{own}; got {value!r}")
-        for name in _POSITIVE:
-            if getattr(self, name) <= 0:
-                raise ValueError(f"TrackerConfig.{name}: expected a positive number, got {getattr(self, name)}")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.type in ("int", "float") and value <= 0 and field.name not in _MAY_BE_ZERO:
+                raise ValueError(f"TrackerConfig.{field.name}: expected a positive number, got {value}")
         self._check_sizes()
         self._check_combination()
 

@@ -1,6 +1,8 @@
 """Weights on disk: one safetensors file with the parameters and, in its header, the config.
 
-file = {parameter name: tensor},  header = {"format": "tapip3d_lite", "config": TrackerConfig as JSON}
+    file = {parameter name: tensor},  header = {"format": "tapip3d_lite", "config": TrackerConfig as JSON}
+
+Such a file can hold no code. The authors' checkpoints are read by `official.load_official`.
 """
 
 from __future__ import annotations
