@@ -1,17 +1,42 @@
-"""Lesson 00, its exercises: queries from pixels, where a camera stands, visibility by depth, hits within a ball."""
+"""Lesson 00, its bars and exercises: queries from pixels, where a camera stands, visibility by depth, hits within a ball."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
+from matplotlib.figure import Figure
 
 from lessons.checker import Exercise, Mistake, check, score_guess
 from lessons.n01 import random_extrinsics, random_intrinsics
 from lessons.widgets import explore
+from tapip3d_lite.figures.flat import label_axes
 from tapip3d_lite.geometry import invert, transform, unproject
 
-__all__ = ["EXERCISES", "check", "explore", "score_guess"]
+__all__ = ["EXERCISES", "check", "explore", "score_guess", "scores_bar"]
 
 Array = np.ndarray
+
+
+def scores_bar(scores: Mapping[str, Mapping[str, float]], metrics: Sequence[str] = ("AJ3D", "APD3D", "OA")) -> Figure:
+    """Scores of several trackers side by side, with the numbers written on the bars.
+
+    Args:
+        scores: tracker name to the dictionary that `evaluate` returns.
+        metrics: which entries to show.
+    """
+    figure = Figure(figsize=(1.6 * len(metrics) + 1.5, 2.4), layout="constrained")
+    ax = figure.add_subplot()
+    step = 0.8 / len(scores)
+    for i, (name, values) in enumerate(scores.items()):
+        at = np.arange(len(metrics)) + (i - (len(scores) - 1) / 2) * step
+        bars = ax.bar(at, [values[m] for m in metrics], step * 0.92, label=name, color=f"C{i}")
+        ax.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
+    ax.set_xticks(range(len(metrics)), metrics)
+    ax.set_ylim(0, 1.1)
+    label_axes(ax, "score", "")
+    ax.legend(fontsize=7, frameon=False, ncols=len(scores), loc="upper center", bbox_to_anchor=(0.5, 1.18))
+    return figure
 
 
 def _one_pixel(rng: np.random.Generator, size: int) -> tuple:

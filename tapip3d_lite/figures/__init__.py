@@ -20,9 +20,7 @@ from tapip3d_lite.figures.flat import (
     depth_map,
     frame_with_tracks,
     overview,
-    scores_bar,
     track_colors,
-    tracks_over_time,
 )
 from tapip3d_lite.figures.scene_3d import tracks_3d, tracks_3d_static
 from tapip3d_lite.files import atomic_path
@@ -34,12 +32,10 @@ __all__ = [
     "overview",
     "save_html",
     "save_png",
-    "scores_bar",
     "show_3d",
     "track_colors",
     "tracks_3d",
     "tracks_3d_static",
-    "tracks_over_time",
 ]
 
 

@@ -1,8 +1,8 @@
-"""Flat figures: frames with tracks, depth, contact sheets, coordinates over time, score bars."""
+"""Flat figures: frames with tracks, depth, contact sheets."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import matplotlib
 import numpy as np
@@ -97,47 +97,6 @@ def contact_sheet(clips: Clip | Sequence[Clip], frames: int = 6, width: float = 
             draw_image(ax, clip.video[t], title)
             if column == 0:
                 ax.set_ylabel(clip.name, fontsize=8, color=INK)
-    return figure
-
-
-def tracks_over_time(
-    curves: Mapping[str, np.ndarray], labels: Sequence[str] = ("x", "y", "z"), unit: str = "scene units"
-) -> Figure:
-    """Coordinates of one point over time, one panel a coordinate, one curve an entry.
-
-    Args:
-        curves: name to (T, C); NaN leaves gaps.
-        labels: names of the C coordinates.
-        unit: for the vertical axes.
-    """
-    figure = _figure(3.0 * len(labels), 2.3)
-    for i, label in enumerate(labels):
-        ax = figure.add_subplot(1, len(labels), i + 1)
-        for name, curve in curves.items():
-            ax.plot(curve[:, i], label=name, lw=1.6)
-        label_axes(ax, f"{label} ({unit})", "frame")
-    figure.axes[0].legend(fontsize=7, frameon=False)
-    return figure
-
-
-def scores_bar(scores: Mapping[str, Mapping[str, float]], metrics: Sequence[str] = ("AJ3D", "APD3D", "OA")) -> Figure:
-    """Scores of several trackers side by side, with the numbers written on the bars.
-
-    Args:
-        scores: tracker name to the dictionary that `evaluate` returns.
-        metrics: which entries to show.
-    """
-    figure = _figure(1.6 * len(metrics) + 1.5, 2.4)
-    ax = figure.add_subplot()
-    step = 0.8 / len(scores)
-    for i, (name, values) in enumerate(scores.items()):
-        at = np.arange(len(metrics)) + (i - (len(scores) - 1) / 2) * step
-        bars = ax.bar(at, [values[m] for m in metrics], step * 0.92, label=name, color=f"C{i}")
-        ax.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
-    ax.set_xticks(range(len(metrics)), metrics)
-    ax.set_ylim(0, 1.1)
-    label_axes(ax, "score", "")
-    ax.legend(fontsize=7, frameon=False, ncols=len(scores), loc="upper center", bbox_to_anchor=(0.5, 1.18))
     return figure
 
 
