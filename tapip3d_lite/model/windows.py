@@ -183,7 +183,7 @@ class State:
 def query_support(
     neighborhood: Callable[..., Neighbors], scene: Scene, times: Tensor, coords: Tensor
 ) -> list[Neighbors]:
-    """Neighbourhoods of queries, the query itself first.
+    """Neighbourhoods of queries, each in the frame where it was asked.
 
     Args:
         neighborhood: as `neighbors.KNearest.forward`.
@@ -192,44 +192,39 @@ def query_support(
         coords: (B, N, 3) queries in the scene's space.
 
     Returns:
-        For each level (B, N, 1 + K, ...): row 0 is the query, with the bilinear feature at its pixel and index -1.
+        For each level (B, N, 1 + K, ...), see `around_queries`.
     """
-    groups = []  # (frame, columns queried there in any batch element, their cells' pixels)
-    for frame in times.unique().tolist():
-        columns = (times == frame).any(0).nonzero()[:, 0]
-        here = scene.frames.cut(frame, frame + 1)
-        uv = scene.space.to_pixels(coords[:, None, columns], here.intrinsics, here.extrinsics)
-        groups.append((frame, columns, uv))
-    return [_level_support(neighborhood, level, scene.frames.size, groups, times, coords) for level in scene.levels]
+    supports = []
+    for level in scene.levels:
+        whole: dict[str, Tensor] = {}
+        for frame in times.unique().tolist():
+            columns = (times == frame).any(0).nonzero()[:, 0]  # (n,) asked here in any batch element
+            mine = (times[:, columns] == frame)[..., None, None]  # (B, n, 1, 1)
+            near = around_queries(
+                neighborhood, scene.cut(frame, frame + 1), level.cut(frame, frame + 1), coords[:, columns]
+            )
+            for name in ("features", "points", "indices"):
+                new = getattr(near, name)
+                if new is not None:
+                    new = new[:, 0].unsqueeze(-1) if name == "indices" else new[:, 0]  # (B, n, 1 + K, ...)
+                    total = whole.setdefault(name, new.new_zeros(*times.shape, *new.shape[2:]))
+                    total[:, columns] = torch.where(mine, new, total[:, columns])
+        indices = whole["indices"].squeeze(-1) if "indices" in whole else None
+        supports.append(Neighbors(whole["features"], whole["points"], coords, indices))
+    return supports
 
 
-def _level_support(
-    neighborhood: Callable[..., Neighbors],
-    level: Level,
-    size: tuple[int, int],
-    groups: list,
-    times: Tensor,
-    coords: Tensor,
-) -> Neighbors:
-    features = points = indices = None
-    for frame, columns, uv in groups:
-        here = level.cut(frame, frame + 1)
-        cells = level.cells(uv, size)
-        near = neighborhood(here, coords[:, None, columns], cells)  # (B, 1, n, K, ...)
-        center = near.center[:, 0, :, None]  # (B, n, 1, 3)
-        own = bilinear(here.features[:, 0], cells[:, 0])[:, :, None]  # (B, n, 1, C)
-        new = torch.cat([own, near.features[:, 0]], 2), torch.cat([center, near.points[:, 0]], 2)  # (B, n, 1 + K, ...)
-        mine = (times[:, columns] == frame)[..., None, None]  # (B, n, 1, 1)
-        features = _merge(features, columns, mine, new[0], coords)
-        points = _merge(points, columns, mine, new[1], coords)
-        if near.indices is not None:
-            rows = torch.cat([torch.full_like(near.indices[:, 0, :, :1], -1), near.indices[:, 0]], 2)
-            indices = _merge(indices, columns, mine[..., 0], rows, coords)
-    return Neighbors(features, points, coords, indices)
+def around_queries(neighborhood: Callable[..., Neighbors], scene: Scene, level: Level, coords: Tensor) -> Neighbors:
+    """Neighbourhoods (B, T, N, 1 + K, ...) of queries (B, N, 3) in each of T frames, the query itself first.
 
-
-def _merge(total: Tensor | None, columns: Tensor, mine: Tensor, new: Tensor, coords: Tensor) -> Tensor:
-    if total is None:
-        total = new.new_zeros(*coords.shape[:2], *new.shape[2:])
-    total[:, columns] = torch.where(mine, new, total[:, columns])
-    return total
+    That first row has the bilinear feature at the query's pixel and index -1.
+    """
+    frames = scene.frames
+    coords = coords[:, None].expand(-1, len(frames), -1, -1)  # (B, T, N, 3)
+    cells = level.cells(scene.space.to_pixels(coords, frames.intrinsics, frames.extrinsics), frames.size)
+    near = neighborhood(level, coords, cells)  # (B, T, N, K, ...)
+    own = bilinear(level.features.flatten(0, 1), cells.flatten(0, 1)).unflatten(0, coords.shape[:2])  # (B, T, N, C)
+    features = torch.cat([own.unsqueeze(3), near.features], 3)
+    points = torch.cat([near.center.unsqueeze(3), near.points], 3)
+    first = None if near.indices is None else torch.full_like(near.indices[..., :1], -1)
+    return Neighbors(features, points, coords, None if first is None else torch.cat([first, near.indices], 3))

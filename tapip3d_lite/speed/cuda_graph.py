@@ -14,9 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.model.cloud import Level
-from tapip3d_lite.model.neighbors import Neighbors, bilinear
-from tapip3d_lite.model.windows import Scene
+from tapip3d_lite.model.neighbors import Neighbors
+from tapip3d_lite.model.windows import Scene, around_queries
 
 _WARM = 2  # runs before recording: they compile, and choose algorithms
 
@@ -93,33 +92,13 @@ def _tensors(batch: Any) -> list[Tensor]:
 def support_at_once(
     neighborhood: Callable[..., Neighbors], scene: Scene, times: Tensor, coords: Tensor
 ) -> list[Neighbors]:
-    """All queries in all frames, of which each query's own is kept: T times the work, T times fewer calls for a GPU."""
-    frames, (batch, count) = scene.frames, times.shape
-    everywhere = coords[:, None].expand(-1, len(frames), -1, -1)
-    uv = scene.space.to_pixels(everywhere, frames.intrinsics, frames.extrinsics)
-    row = torch.arange(batch, device=coords.device)[:, None], times, torch.arange(count, device=coords.device)
+    """As `model.windows.query_support`: all queries in all frames, of which each query's own frame is kept.
+
+    That is T times the work, but T times fewer calls, and nothing depends on values.
+    """
+    batch, count = times.shape
+    own = torch.arange(batch, device=times.device)[:, None], times, torch.arange(count, device=times.device)
+    found = [around_queries(neighborhood, scene, level, coords) for level in scene.levels]
     return [
-        _level_support(neighborhood, level, everywhere, level.cells(uv, frames.size), row, coords)
-        for level in scene.levels
+        Neighbors(x.features[own], x.points[own], coords, None if x.indices is None else x.indices[own]) for x in found
     ]
-
-
-def _level_support(
-    neighborhood: Callable[..., Neighbors],
-    level: Level,
-    everywhere: Tensor,
-    cells: Tensor,
-    row: tuple[Tensor, Tensor, Tensor],
-    coords: Tensor,
-) -> Neighbors:
-    near = neighborhood(level, everywhere, cells)  # (B, T, N, K, ...)
-    own = bilinear(level.features.flatten(0, 1), cells.flatten(0, 1)).unflatten(0, (len(coords), -1))[:, :, :, None]
-    center = near.center.unsqueeze(-2)
-    features, points = (
-        torch.cat([own, near.features], 3)[row],
-        torch.cat([center, near.points], 3)[row],
-    )  # (B, N, 1 + K, ...)
-    if near.indices is None:
-        return Neighbors(features, points, coords, None)
-    indices = near.indices[row]
-    return Neighbors(features, points, coords, torch.cat([torch.full_like(indices[..., :1], -1), indices], -1))
