@@ -16,6 +16,9 @@ import numpy as np
 import torch
 
 Array = np.ndarray | torch.Tensor
+# Both benchmarks measure pixels on an image of this size, and at these thresholds.
+RASTER = 256
+THRESHOLDS = (1, 2, 4, 8, 16)
 
 
 def transform(points: Array, pose: Array) -> Array:

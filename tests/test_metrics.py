@@ -8,7 +8,8 @@ import pytest
 
 import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
-from tapip3d_lite.evaluation.metrics import MODES, SCALINGS, THRESHOLDS
+from tapip3d_lite.evaluation.metrics import MODES, SCALINGS
+from tapip3d_lite.geometry import THRESHOLDS
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN = ROOT / "tests" / "data"

@@ -9,7 +9,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.files import atomic_path
-from tapip3d_lite.simulate.config import SimulationConfig
+from tapip3d_lite.simulate.settings import SimulationConfig
 from tapip3d_lite.simulate.simulator import simulate_clip
 
 
