@@ -158,10 +158,7 @@ _MESSAGES = {
 _REMEDIES = {
     "camera_to_world": ("Invert every matrix (geometry.invert).", _inverse),
     "opengl_axes": ("Multiply extrinsics from the left by diag(1, -1, -1, 1).", _flip),
-    "depth_in_millimetres": (
-        "Multiply depths by 0.001.",
-        lambda clip: _rebuilt(clip, depths=clip.depths * np.float32(1e-3)),
-    ),
+    "depth_in_millimetres": ("Multiply depths by 0.001.", lambda c: _rebuilt(c, depths=c.depths * np.float32(1e-3))),
     "poses_in_millimetres": ("Multiply translations by 0.001.", _smaller_translations),
 }
 # One of each may be needed together.
