@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from lessons.samples import SAMPLES, longest_gap
 
+from lessons.samples import SAMPLES, longest_gap
 from tapip3d_lite import __main__
 from tapip3d_lite.clip import Tracks
 from tapip3d_lite.evaluation import benchmark, lite_splits

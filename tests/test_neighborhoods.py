@@ -6,15 +6,15 @@ from matplotlib.patches import Circle
 
 from lessons.n03_cells import Cells, silhouettes, track_objects
 from tapip3d_lite.geometry import point_map, project
-from tapip3d_lite.simulate import object_maps, simulate_rollout, render_clip
+from tapip3d_lite.simulate import object_maps, record, render_clip
 from lessons.n03_exercises import search, walls
 from lessons.n03_figures import Around, RIGHT, WRONG, neighborhoods_3d, proof_view, share_curves, two_neighborhoods
 
 
 @pytest.fixture(scope="module")
 def filmed():
-    rollout = simulate_rollout(3, frames=4, size=(48, 64), sky=True, tracks=60)
-    return render_clip(rollout), object_maps(rollout)
+    recording = record(3, frames=4, size=(48, 64), sky=True, tracks=60)
+    return render_clip(recording), object_maps(recording)
 
 
 @pytest.fixture(scope="module")

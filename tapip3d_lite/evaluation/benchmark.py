@@ -18,7 +18,7 @@ from tapip3d_lite.evaluation.baselines import TrackerLike
 from tapip3d_lite.evaluation.evaluate import evaluate
 from tapip3d_lite.evaluation.intervals import Estimate, bootstrap_interval, paired_difference
 from tapip3d_lite.evaluation.lite_splits import COUNT, FOLDER, SPLITS, benchmark_clips, check_split
-from tapip3d_lite.files import atomic_path
+from tapip3d_lite.files import write_text
 
 __all__ = [
     "METRICS",
@@ -107,8 +107,7 @@ def save_results(path: str | Path, results: Results, versions: Mapping[str, str 
         label: {"version": (versions or {}).get(label), "scores": _map(scores, lambda x: None if math.isnan(x) else x)}
         for label, scores in results.items()
     }
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(rows, indent=1) + "\n")
 
 
 def load_results(path: str | Path) -> tuple[Results, dict[str, str | None]]:

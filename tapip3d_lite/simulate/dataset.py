@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tapip3d_lite.files import atomic_path
+from tapip3d_lite.files import write_text
 from tapip3d_lite.simulate.settings import SimulationConfig
 from tapip3d_lite.simulate.simulator import simulate_clip
 
@@ -100,8 +100,7 @@ def _claim(folder: Path, config: SimulationConfig | Recipe) -> None:
     elif any(folder.glob("clip_*.npz")):
         raise ValueError(f"simulate_dataset: {folder} holds clips but no {DESCRIPTION}; choose another folder")
     else:
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(description, indent=2) + "\n")
+        write_text(path, json.dumps(description, indent=2) + "\n")
     for leftover in folder.glob(".clip_*.npz"):
         leftover.unlink()
 

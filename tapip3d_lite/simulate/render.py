@@ -147,7 +147,7 @@ def _sunlit(
     asked: np.ndarray,
     shape: tuple[int, int],
 ) -> np.ndarray:
-    """The visible share of the sun (R,) float32 at points on a grid of `shape`; 1 without a look where not `asked`."""
+    """The visible share of the sun (R,) float32 at points on a grid of `shape`; only where `asked`, else 1."""
     rows, columns = np.indices(shape).reshape(2, -1)
     # Numbered along the diagonals, so that each 2x2 block of the checkerboard's fields looks at all four points.
     index = (rows + columns) // 2 % 2 * 2 + (rows - columns) // 2 % 2
