@@ -16,7 +16,6 @@ import tyro
 from tyro.conf import Positional, arg
 
 import tapip3d_lite as t3d
-from tapip3d_lite import commands
 from tapip3d_lite.training.config import TrainConfig
 
 
@@ -82,7 +81,7 @@ def benchmark(
     tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("lite", "static", "klt"),
     split: Annotated[tuple[str, ...], arg(help="static-camera, moving-camera, occlusion; default: all")] = (),
     space: Annotated[tuple[str, ...], arg(help="world, camera or both (learnt trackers)")] = ("world",),
-    count: Annotated[int | None, arg(help="only the first so many clips of each split")] = None,
+    count: Annotated[int | None, arg(help="only the first clips of each split")] = None,
     out: Annotated[Path | None, arg(help="JSON with every clip's scores; an interrupted run is continued")] = None,
     figure: Annotated[Path | None, arg(help="picture (PNG) of means with intervals")] = None,
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
@@ -114,7 +113,7 @@ def demo(
 
 
 def check(clip: Positional[Path], /) -> None:
-    """Look for the usual mix-ups in a clip: camera direction, axes, intrinsics, units, ray length."""
+    """Look for the usual mistakes in a clip: camera direction, axes, intrinsics, units, ray length."""
     findings = t3d.check_clip(t3d.load_clip(clip, points=False))
     print("\n".join(map(str, findings)) if findings else f"{clip}: nothing suspicious found")
 
@@ -141,18 +140,13 @@ def train(
     resume: Annotated[bool, arg(help="continue from the folder's checkpoint, with its recipe")] = False,
     device: Annotated[str, arg(help="cpu or cuda; several processes: torchrun -m tapip3d_lite train …")] = "cpu",
     workers: Annotated[
-        int | None, arg(help="processes that make examples meanwhile; default: 0 on a CPU, else cores less two")
+        int | None, arg(help="processes that prepare examples; default: 0 on a CPU, else cores less two")
     ] = None,
     compiled: Annotated[bool, arg(help="compile the tracker's parts, for a GPU: slow to start, then faster")] = False,
-    measure: Annotated[bool, arg(help="only print where a step's time goes, and what backward keeps (CPU)")] = False,
 ) -> None:
-    """Train a tracker on simulated clips, by default by the recipe of --preset (lite or paper); Ctrl-C saves and stops, --resume goes on exactly there."""
+    """Train a tracker on simulated clips, by default with the recipe of --preset (lite or paper); Ctrl-C saves and stops, --resume continues exactly there."""
     from tapip3d_lite.lab.train import train as run
 
-    if measure:
-        from tests.bench.training_cost import report
-
-        return print(report(config, (data or out / "clips") / "train"))
     try:
         finished, text = run(out, config, data, resume, device, workers, compiled)
     except FloatingPointError as error:
@@ -162,6 +156,47 @@ def train(
         sys.exit(130)
 
 
+def card(
+    folder: Positional[Path],
+    results: Positional[Path],
+    /,
+    hardware: Annotated[str, arg(help="what it was trained on, in words")],
+    out: Annotated[Path, arg(help="Markdown file")] = Path("MODEL_CARD.md"),
+    name: Annotated[str, arg(help="of the model")] = "lite",
+    weights: Annotated[Path | None, arg(help="the file, if not the folder's own")] = None,
+    command: Annotated[str | None, arg(help="that made it, e.g. with torchrun; default: from the recipe")] = None,
+) -> None:
+    """Write the model card of a training folder and of results that `benchmark --out` wrote."""
+    from tapip3d_lite.files import write_text
+    from tapip3d_lite.lab.card import model_card
+
+    write_text(out, model_card(folder, results, hardware, name, command, weights))
+    print(f"wrote {out}")
+
+
+def curves(
+    folders: Positional[Annotated[tuple[Path, ...], arg(help="of trainings, or their log.jsonl; one row each")]],
+    /,
+    out: Annotated[Path, arg(help="picture (PNG)")] = Path("learning_curves.png"),
+    by: Annotated[str, arg(help="step or minutes")] = "step",
+) -> None:
+    """Draw the learning curves of trainings, finished or not: matching, loss, accuracy, held-out scores."""
+    from tapip3d_lite.figures.curves import learning_curves
+    from tapip3d_lite.training.journal import read_log
+
+    logs = [(folder.stem if folder.is_file() else folder.resolve().name, read_log(folder)) for folder in folders]
+    t3d.figures.save_png(learning_curves(logs, by=by), out)
+    print(f"wrote {out}")
+
+
+def import_(checkpoint: Positional[Path], out: Positional[Path], /) -> None:
+    """Convert the authors' checkpoint (.pth) to a weights file of ours (.safetensors)."""
+    tracker = t3d.load_official(checkpoint)
+    t3d.save_weights(tracker, out)
+    count = sum(p.numel() for p in tracker.parameters())
+    print(f"wrote {out}: {count / 1e6:.2f} M parameters; use it with --tracker {out}")
+
+
 COMMANDS = {
     "track": track,
     "evaluate": evaluate,
@@ -169,15 +204,10 @@ COMMANDS = {
     "demo": demo,
     "check": check,
     "simulate": simulate,
-    "samples": commands.samples,
     "train": train,
-    "card": commands.card,
-    "curves": commands.curves,
-    "import": commands.import_,
-    "picture": commands.picture,
-    "bench": commands.bench,
-    "formulas": commands.formulas,
-    "teach": commands.teach,
+    "card": card,
+    "curves": curves,
+    "import": import_,
 }
 
 
@@ -189,7 +219,7 @@ def _train(arguments: list[str]) -> Callable[..., None]:
 
 
 def main() -> None:
-    """Run one command; what the user can mend is one line and exit code 2."""
+    """Run one command; bad input ends with one line and exit code 2."""
     try:
         chosen = COMMANDS | {"train": _train(sys.argv[1:])}
         tyro.extras.subcommand_cli_from_dict(chosen, prog="tapip3d_lite", description=__doc__.splitlines()[0])

@@ -1,42 +1,41 @@
-"""`check_clip`: find the usual mix-ups of RGB-D clips from the data alone, with the evidence as a number.
+"""`check_clip`: find the usual mistakes in RGB-D clips from the data alone, with the evidence as a number.
 
-Two facts of a correct clip are tested, and every finding says how far they fail before and after its fix:
+Two properties of a correct clip are measured, and every finding states them before and after its fix:
 
 - *Consistency.* Most of a scene stands still: pixels lifted from frame t and projected into frame t' must meet the
   depth stored there. Wrong pose conventions, axes, units and intrinsics break that as soon as the camera moves.
 - *Flatness.* The inverse of z-depth is affine over any plane (1/z = (a u + b v + c) in pixels), so its second
   differences vanish on floors and walls. Those of the inverse ray length do not. This needs no camera motion.
 
-A camera that never moves carries no evidence about poses, and about units only that sensors store millimetres as whole
-numbers. Colour order (BGR for RGB) cannot be told from the data and is not checked.
+A camera that never moves provides no evidence about poses, and about units only that sensors store millimetres as
+whole numbers. Colour order (BGR for RGB) cannot be determined from the data and is not checked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.consistency import consistency, flatness
-from tapip3d_lite.geometry import invert, pixel_grid, unproject
+from tapip3d_lite.geometry import invert, point_map, project, unproject
 
-# A fix must leave at most this share of the error, once for each change that it makes.
-_GAIN = 0.4
-_NOISE = 0.001  # exact clips stay well below; a mix-up that changes less than this does no harm either
+_GAIN = 0.4  # a fix must leave at most this share of the error, once for each change that it makes
+_NOISE = 0.001  # exact clips stay well below; a mistake that changes less than this does no harm either
+_CAP = 0.25  # relative depth errors above this count as this: the point is simply lost
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One suspected mix-up.
+    """One suspected mistake.
 
     Attributes:
         name: short key, e.g. `"camera_to_world"`.
         message: what seems wrong.
-        measure: what the two numbers are.
-        before: the measure as the clip stands.
+        measure: what the two numbers measure.
+        before: the measure of the clip as given.
         after: the measure once the fix is applied.
         remedy: what to do, in words.
         fix: maps the clip to the corrected clip.
@@ -62,26 +61,22 @@ def check_clip(clip: Clip) -> list[Finding]:
         clip: any clip; ground truth is not used.
 
     Returns:
-        One `Finding` for each mix-up in the simplest set of fixes that makes the clip consistent. Applying them in
+        One `Finding` for each mistake in the simplest set of fixes that makes the clip consistent. Applying them in
         the order given repairs the clip.
     """
-    findings = [*_wrong_intrinsics(clip)]
-    repaired = _apply(clip, findings)
-    ray = _ray_length(repaired)
-    if ray is not None:
-        findings.append(ray)
-        repaired = ray.fix(repaired)
-    return findings + (_wrong_motion(repaired) if _moves(clip) else _whole_numbers(repaired))
+    findings, repaired = [], clip
+    for test in (_wrong_intrinsics, _ray_length):
+        for finding in test(repaired):
+            findings.append(finding)
+            repaired = finding.fix(repaired)
+    moves = np.ptp(clip.extrinsics, axis=0).max() > 1e-6
+    return findings + (_wrong_motion(repaired) if moves else _whole_numbers(repaired))
 
 
-def _moves(clip: Clip) -> bool:
-    return bool(np.ptp(clip.extrinsics, axis=0).max() > 1e-6)
-
-
-def _wrong_intrinsics(clip: Clip) -> Iterator[Finding]:
-    """The principal point says which image the intrinsics were made for: it lies near the middle of nearly all."""
+def _wrong_intrinsics(clip: Clip) -> list[Finding]:
+    """The principal point reveals the size that the intrinsics were made for: it lies near the middle of most images."""
     height, width = clip.size
-    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    centre = np.array([width - 1, height - 1]) / 2
     point = np.median(clip.intrinsics[:, :2, 2], axis=0).astype(np.float64)
     focal = float(np.median(clip.intrinsics[:, 0, 0]))
     offset = float(np.abs(point / centre - 1).max())
@@ -93,24 +88,23 @@ def _wrong_intrinsics(clip: Clip) -> Iterator[Finding]:
     elif offset > 0.1 and (point > 0).all():
         ratio = centre / point
         scaled = _with_intrinsics(ratio, 0.0)
-        # A crop shifts the point as well. Motion decides; without it only a point outside the image is proof.
+        # A crop shifts the point as well. Motion decides; without motion only a point outside the image proves it.
         likely = bool((point > (width, height)).any())
         if not _motion_prefers(clip, scaled(clip), likely):
-            return
+            return []
         size = np.rint(2 * point + 1).astype(int)
         message = f"intrinsics look made for a {size[0]}x{size[1]} image, the video is {width}x{height}"
         remedy = f"Multiply row 0 by {ratio[0]:.4g} and row 1 by {ratio[1]:.4g} (geometry.resize_intrinsics)."
         name = "intrinsics_of_another_size"
     else:
-        return
-    fixed = np.median(scaled(clip).intrinsics[:, :2, 2], axis=0)
-    after = float(np.abs(fixed / centre - 1).max())
+        return []
+    after = float(np.abs(np.median(scaled(clip).intrinsics[:, :2, 2], axis=0) / centre - 1).max())
     measure = "principal point's distance from the centre, in half images"
-    yield Finding(name, message, measure, offset, after, remedy, scaled)
+    return [Finding(name, message, measure, offset, after, remedy, scaled)]
 
 
 def _motion_prefers(clip: Clip, fixed: Clip, otherwise: bool) -> bool:
-    """Whether static-scene consistency speaks for the fix; `otherwise` where it says nothing either way."""
+    """Whether static-scene consistency supports the fix; `otherwise` where it supports neither."""
     before, after = consistency(clip), consistency(fixed)
     if max(before, after) < 0.1 * _NOISE or min(before, after) > _GAIN * max(before, after):
         return otherwise
@@ -127,21 +121,18 @@ def _with_intrinsics(scale: np.ndarray, shift: float) -> Callable[[Clip], Clip]:
     return fix
 
 
-def _ray_length(clip: Clip) -> Finding | None:
-    fixed = _ray_to_z(clip)
-    before, after = flatness(clip), flatness(fixed)
+def _ray_length(clip: Clip) -> list[Finding]:
+    before, after = flatness(clip), flatness(_ray_to_z(clip))
     if before < 2e-4 or after > 0.3 * before:
-        return None
+        return []
     remedy = "Divide the depth by |K^-1 (u, v, 1)| of each pixel."
     message = "depths look like ray lengths, not z: planes bulge"
-    return Finding("ray_length", message, "curvature of planes in 1/depth", before, after, remedy, _ray_to_z)
+    return [Finding("ray_length", message, "curvature of planes in 1/depth", before, after, remedy, _ray_to_z)]
 
 
 def _ray_to_z(clip: Clip) -> Clip:
-    height, width = clip.size
-    uv = pixel_grid(height, width, clip.depths).reshape(-1, 2)
-    rays = unproject(uv, np.ones(len(uv), np.float32), clip.intrinsics)
-    return _rebuilt(clip, depths=clip.depths / np.linalg.norm(rays, axis=-1).reshape(clip.depths.shape))
+    rays = point_map(np.ones_like(clip.depths), clip.intrinsics)
+    return _rebuilt(clip, depths=clip.depths / np.linalg.norm(rays, axis=-1))
 
 
 def _flip(clip: Clip) -> Clip:
@@ -152,59 +143,52 @@ def _inverse(clip: Clip) -> Clip:
     return _rebuilt(clip, extrinsics=invert(clip.extrinsics))
 
 
-def _depth_scale(factor: float) -> Callable[[Clip], Clip]:
-    return lambda clip: _rebuilt(clip, depths=clip.depths * np.float32(factor))
-
-
-def _translation_scale(clip: Clip) -> Clip:
+def _smaller_translations(clip: Clip) -> Clip:
     extrinsics = clip.extrinsics.copy()
     extrinsics[:, :3, 3] *= 1e-3
     return _rebuilt(clip, extrinsics=extrinsics)
 
 
-# (name, message, remedy, fix); a pose fix and a unit fix may be needed together.
-_POSES = [
-    ("camera_to_world", "extrinsics look camera-to-world", "Invert every matrix (geometry.invert).", _inverse),
-    (
-        "opengl_axes",
-        "cameras look along -z with y up (OpenGL, Blender)",
-        "Multiply extrinsics from the left by diag(1, -1, -1, 1).",
-        _flip,
-    ),
-]
-_UNITS = [
-    (
-        "depth_in_millimetres",
-        "depths are 1000 times too large for the poses",
-        "Multiply depths by 0.001.",
-        _depth_scale(1e-3),
-    ),
-    (
-        "poses_in_millimetres",
-        "translations are 1000 times too large for the depths",
-        "Multiply translations by 0.001.",
-        _translation_scale,
-    ),
-]
+_MESSAGES = {
+    "camera_to_world": "extrinsics look camera-to-world",
+    "opengl_axes": "cameras look along -z with y up (OpenGL, Blender)",
+    "depth_in_millimetres": "depths are 1000 times too large for the poses",
+    "poses_in_millimetres": "translations are 1000 times too large for the depths",
+}
+_REMEDIES = {
+    "camera_to_world": ("Invert every matrix (geometry.invert).", _inverse),
+    "opengl_axes": ("Multiply extrinsics from the left by diag(1, -1, -1, 1).", _flip),
+    "depth_in_millimetres": ("Multiply depths by 0.001.", lambda c: _rebuilt(c, depths=c.depths * np.float32(1e-3))),
+    "poses_in_millimetres": ("Multiply translations by 0.001.", _smaller_translations),
+}
+# One of each may be needed together.
+_POSES = [], ["camera_to_world"], ["opengl_axes"], ["camera_to_world", "opengl_axes"]
+_UNITS = [], ["depth_in_millimetres"], ["poses_in_millimetres"]
 
 
 def _wrong_motion(clip: Clip) -> list[Finding]:
-    """The simplest set of pose and unit fixes that makes the static scene consistent, if it is not."""
+    """The simplest set of pose and unit fixes that makes an inconsistent static scene consistent."""
     before = consistency(clip)
     if before < _NOISE:
         return []
-    poses = [[], [_POSES[0]], [_POSES[1]], _POSES]
-    units = [[], [_UNITS[0]], [_UNITS[1]]]
     scored = []
-    for pose, unit in product(poses, units):
-        turned = _apply(clip, pose)
-        if unit and not _plausible_unit(turned, unit[0][0]):
-            continue
-        error = consistency(_apply(turned, unit))
-        scored.append((error / _GAIN ** len(pose + unit), error, pose + unit))
-    _, after, fixes = min(scored, key=lambda row: row[0])
-    measure = "relative depth error of the static scene"
-    return [Finding(n, m, measure, before, after, remedy, fix) for n, m, remedy, fix in fixes]
+    for pose, unit in product(_POSES, _UNITS):
+        turned = _fixed(clip, pose)
+        if not unit or _plausible_unit(turned, unit[0]):
+            error = consistency(_fixed(turned, unit))
+            scored.append((error / _GAIN ** len(pose + unit), error, pose + unit))
+    _, after, names = min(scored, key=lambda row: row[0])
+    return [_finding(name, "relative depth error of the static scene", before, after) for name in names]
+
+
+def _fixed(clip: Clip, names: list[str]) -> Clip:
+    for name in names:
+        clip = _REMEDIES[name][1](clip)
+    return clip
+
+
+def _finding(name: str, measure: str, before: float, after: float) -> Finding:
+    return Finding(name, _MESSAGES[name], measure, before, after, *_REMEDIES[name])
 
 
 def _plausible_unit(clip: Clip, name: str) -> bool:
@@ -219,17 +203,96 @@ def _whole_numbers(clip: Clip) -> list[Finding]:
     share = float((depths == np.rint(depths)).mean())
     if share < 1 or np.median(depths) < 100:
         return []
-    name, _, remedy, fix = _UNITS[0]
     after = float(((depths * 1e-3) == np.rint(depths * 1e-3)).mean())
-    return [Finding(name, "depths look like millimetres", "share of whole numbers", share, after, remedy, fix)]
-
-
-def _apply(clip: Clip, fixes: list) -> Clip:
-    for fix in fixes:
-        clip = (fix.fix if isinstance(fix, Finding) else fix[-1])(clip)
-    return clip
+    finding = _finding("depth_in_millimetres", "share of whole numbers", share, after)
+    return [replace(finding, message="depths look like millimetres")]
 
 
 def _rebuilt(clip: Clip, **changes: np.ndarray) -> Clip:
     # World-space queries and tracks belong to the old cameras: a repaired clip starts without them.
     return replace(clip, queries=None, tracks=None, **changes)
+
+
+def consistency(clip: Clip, samples: int = 1500, pairs: int = 8) -> float:
+    """Static-scene error: how well points carried between frames meet the depth there, over all frame pairs.
+
+    The number is a low quantile of relative depth errors, since parts of a correct clip disagree too: moving objects,
+    and pixels that become hidden or leave the view.
+
+    Args:
+        clip: the clip.
+        samples: pixels lifted per pair.
+        pairs: frame pairs, spread over the clip at growing gaps.
+
+    Returns:
+        0 for a perfect static scene; at most 0.25, the value of a point that is lost altogether.
+    """
+    rng = np.random.default_rng(0)
+    errors = [_carry(clip, t, s, samples, rng) for t, s in _frame_pairs(len(clip), pairs)]
+    pooled = np.concatenate(errors) if errors else np.zeros(1)
+    return float(np.quantile(pooled, 0.25)) if pooled.size else _CAP
+
+
+def flatness(clip: Clip, frames: int = 4) -> float:
+    """Lower quartile of the relative second differences of inverse depth: near 0 in scenes with planes.
+
+    Args:
+        clip: any clip.
+        frames: number of frames to look at.
+
+    Returns:
+        The quartile over pixels, dimensionless; the step is a twelfth of the image.
+    """
+    step = max(1, min(clip.size) // 12)
+    chosen = np.linspace(0, len(clip) - 1, frames).astype(int)
+    values = np.concatenate([_second_differences(clip.depths[t], step) for t in chosen])
+    return float(np.quantile(values, 0.25)) if values.size else 0.0
+
+
+def _frame_pairs(frames: int, pairs: int) -> list[tuple[int, int]]:
+    gaps = sorted({max(1, round(frames * share)) for share in (0.1, 0.25, 0.5)})
+    chosen = [(t, t + gap) for gap in gaps for t in np.linspace(0, max(frames - gap - 1, 0), pairs // 2).astype(int)]
+    return [(t, s) for t, s in dict.fromkeys(chosen) if s < frames]
+
+
+def _carry(clip: Clip, t: int, s: int, samples: int, rng: np.random.Generator) -> np.ndarray:
+    """Capped relative depth errors of pixels of frame t seen from frame s."""
+    v, u = np.nonzero(clip.depths[t])
+    if not len(v):
+        return np.zeros(0)
+    pick = rng.integers(0, len(v), samples)
+    uv = np.stack([u[pick], v[pick]], -1).astype(np.float64)
+    cameras = [clip.intrinsics[[t, s]].astype(np.float64), clip.extrinsics[[t, s]].astype(np.float64)]
+    points = unproject(uv, clip.depths[t, v[pick], u[pick]].astype(np.float64), cameras[0][0], cameras[1][0])
+    target, z = project(points, cameras[0][1], cameras[1][1])
+    seen = _bilinear_inverse(clip.depths[s], target)
+    inside = np.isfinite(seen) & (z > 0)
+    error = np.full(samples, _CAP)
+    error[inside] = np.minimum(np.abs(z[inside] * seen[inside] - 1), _CAP)
+    return error[~np.isnan(seen)]  # a pixel without depth is no evidence
+
+
+def _bilinear_inverse(depth: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """1/z at sub-pixel positions (exact on planes): NaN on invalid depth, infinite outside the image."""
+    (height, width), inverse = depth.shape, _inverse_depth(depth)
+    inside = ((uv >= 0) & (uv <= (width - 1, height - 1))).all(-1)
+    safe = np.where(inside[:, None], uv, 0)
+    u0, v0 = np.minimum(safe.astype(int), (width - 2, height - 2)).T
+    a, b = safe[:, 0] - u0, safe[:, 1] - v0
+    top = inverse[v0, u0] * (1 - a) + inverse[v0, u0 + 1] * a
+    bottom = inverse[v0 + 1, u0] * (1 - a) + inverse[v0 + 1, u0 + 1] * a
+    return np.where(inside, top * (1 - b) + bottom * b, np.inf)
+
+
+def _inverse_depth(depth: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.where(depth > 0, 1 / depth.astype(np.float64), np.nan)
+
+
+def _second_differences(depth: np.ndarray, step: int) -> np.ndarray:
+    inverse = _inverse_depth(depth)
+    horizontal = inverse[:, 2 * step :] + inverse[:, : -2 * step] - 2 * inverse[:, step:-step]
+    vertical = inverse[2 * step :] + inverse[: -2 * step] - 2 * inverse[step:-step]
+    relative = [horizontal / inverse[:, step:-step], vertical / inverse[step:-step]]
+    values = np.abs(np.concatenate([r.ravel() for r in relative]))
+    return values[np.isfinite(values)]

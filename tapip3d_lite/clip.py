@@ -1,4 +1,4 @@
-"""`Clip` and `Tracks`: what every function of the kit takes and returns, and how they lie on disk.
+"""`Clip` and `Tracks`: the data that every function of the library takes and returns, and their files.
 
 A clip on disk is the authors' input npz (`video`, `depths`, `intrinsics`, `extrinsics`, `query_point`) plus, where
 the truth is known, `tracks`, `visible` and `dynamic`. Tracks on disk are the authors' result npz (`coords`, `visibs`,
@@ -93,7 +93,7 @@ class Clip:
         extras: arrays under unknown keys, kept for the round trip to disk.
 
     Raises:
-        ValueError: names the argument, what was expected, what came, and what to do.
+        ValueError: names the argument, the expected and the received value, and what to do.
     """
 
     video: np.ndarray
@@ -195,7 +195,7 @@ def load_clip(path: str | Path, points: bool = True) -> Clip:
 
     Args:
         path: the npz file.
-        points: False leaves queries and tracks aside, for a clip whose cameras are in doubt (`check_clip`).
+        points: False ignores queries and tracks, for a clip whose cameras may be wrong (`check_clip`).
 
     Raises:
         ValueError: the file is missing, truncated, not an npz, needs pickle, or its arrays do not fit together.
@@ -259,7 +259,7 @@ def check_queries(clip: Clip, queries: np.ndarray) -> np.ndarray:
             f"queries: {int(outside.sum())} of {len(queries)} lie outside the view of their frame; row {first} = {queries[first].tolist()} "
             f"projects to (u, v) = {np.round(uv[first], 1).tolist()}, z = {z[first]:.3g} in a {width}x{height} image; "
             "give (t, x, y, z) in world coordinates, or use queries_from_pixels for pixels; if all are outside, the cameras may be "
-            "wrong: check_clip(load_clip(path, points=False)) tells"
+            "wrong: run check_clip(load_clip(path, points=False))"
         )
     return queries
 

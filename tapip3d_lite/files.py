@@ -1,4 +1,4 @@
-"""Writing files so that a crash leaves either the old one or the new one, never half of one."""
+"""Reading and writing files; a crash while writing leaves the old file or the new one, never half of one."""
 
 from __future__ import annotations
 
@@ -31,6 +31,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file (UTF-8) atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def load_npz(path: str | Path, skip: Collection[str] = ()) -> dict[str, np.ndarray]:

@@ -3,9 +3,9 @@
 Axes follow OpenCV (x right, y down, z forward). `extrinsics` map world to camera (`cam_from_world`, 4x4). The
 centre of the top-left pixel is (0, 0), so u = fx * X / Z + cx. Depth is the camera's z, not the ray's length.
 Every function takes NumPy arrays or torch tensors, float32 or float64, with any number of leading batch dimensions
-that broadcast against each other, and returns the same kind of array as it was given.
+that broadcast against each other, and returns the same kind of array.
 
-Paper: TAPIP3D section 3.2 ("lifting to 3D"): X_world = E^-1 (z K^-1 (u, v, 1)).
+The paper (section 3.2) lifts a pixel to X_world = E^-1 (z K^-1 (u, v, 1)).
 """
 
 from __future__ import annotations
@@ -16,6 +16,9 @@ import numpy as np
 import torch
 
 Array = np.ndarray | torch.Tensor
+# Both benchmarks measure pixels on an image of this size, and at these thresholds.
+RASTER = 256
+THRESHOLDS = (1, 2, 4, 8, 16)
 
 
 def transform(points: Array, pose: Array) -> Array:
@@ -75,7 +78,8 @@ def project(points: Array, intrinsics: Array, extrinsics: Array | None = None, m
         points: (..., N, 3) in the world frame, or in the camera frame without extrinsics.
         intrinsics: (..., 3, 3), pixels.
         extrinsics: (..., 4, 4) world to camera, or None.
-        min_z: smallest divisor, for points at or behind the camera, so that the result stays finite; their z tells.
+        min_z: smallest divisor, for points at or behind the camera, so that the result stays finite; the sign of
+            their z reveals them.
 
     Returns:
         uv (..., N, 2) in pixels and z (..., N), the signed z-depth in the camera frame.

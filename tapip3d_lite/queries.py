@@ -1,4 +1,4 @@
-"""Query points (t, x, y, z): checked, lifted from pixels, or laid out as a grid."""
+"""Query points (t, x, y, z): lifted from pixels, or as a grid on a frame."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def queries_from_pixels(clip: Clip, pixels: np.ndarray) -> np.ndarray:
 def grid_queries(clip: Clip, side: int = 16, frame: int = 0, margin: float = 1 / 64) -> np.ndarray:
     """A side x side grid of queries on one frame, without the nodes that fall on invalid depth.
 
-    The outermost nodes keep `margin` times the image width from every border (SEMANTICS: the released support grid).
+    The outermost nodes keep `margin` times the image width from every border, as in the released code's support grid.
 
     Returns:
         (at most side^2, 4) float32 rows (t, x, y, z), row-major.

@@ -3,33 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
 
-import numpy as np
-
-from tapip3d_lite.clip import Clip, Tracks
-from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker
+from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker, TrackerLike
 from tapip3d_lite.files import shipped_weights
 
 _BASELINES = {"static": StaticTracker, "klt": KltTracker}
-
-
-class TrackerLike(Protocol):
-    """What every tracker offers."""
-
-    def track(
-        self,
-        clip: Clip,
-        queries: np.ndarray | None = None,
-        space: str | None = None,
-        iterations: int | None = None,
-        support_grid: int | None = None,
-        bidirectional: bool = True,
-        depth_roi: str | tuple[float, float] | None = "auto",
-        visible_threshold: float | None = None,
-        progress: bool = False,
-    ) -> Tracks:
-        """3D tracks of `queries` (N, 4), of the clip's own queries, or of a grid on the first frame."""
 
 
 def list_trackers() -> list[str]:

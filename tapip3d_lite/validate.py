@@ -1,4 +1,4 @@
-"""Checks of arrays that come from outside: each names the argument, what was expected, what came, and a remedy."""
+"""Checks of the user's arrays: each error names the argument, what was expected, what was received, and a remedy."""
 
 from __future__ import annotations
 

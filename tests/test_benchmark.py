@@ -18,8 +18,8 @@ from tapip3d_lite.evaluation.intervals import bootstrap_interval, paired_differe
 from tapip3d_lite.evaluation.lite_splits import FOLDER, SPLITS, benchmark_clips, differences, fingerprint
 from tapip3d_lite.figures.curves import score_figure
 from tapip3d_lite.lab.leaderboard import score_trackers
-from tapip3d_lite.simulate import record, render_clip, seeds, simulate_clip, simulator
-from tapip3d_lite.simulate.recording import load_recordings, save_recordings
+from tapip3d_lite.simulate import render_clip, seeds, simulate_clip, simulate_rollout, simulator
+from tapip3d_lite.simulate.rollout import load_rollouts, save_rollouts
 
 
 def same(a, b):
@@ -42,7 +42,7 @@ def small():
     return [replace(clip, name=f"static-camera-{i:02d}") for i, clip in enumerate(clips)]
 
 
-# --- recordings -----------------------------------------------------------------------------------------------------
+# --- rollouts -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -52,8 +52,12 @@ def small():
 )
 def test_a_recording_films_the_same_clip_bit_for_bit(tmp_path, settings):
     settings = settings | {"frames": 4, "size": (40, 56), "tracks": 30}
-    save_recordings(tmp_path / "r.npz", [record(9, **settings), record(8, **settings)], [{"mark": np.arange(3)}] * 2)
-    (first, marks), (second, _) = load_recordings(tmp_path / "r.npz")
+    save_rollouts(
+        tmp_path / "r.npz",
+        [simulate_rollout(9, **settings), simulate_rollout(8, **settings)],
+        [{"mark": np.arange(3)}] * 2,
+    )
+    (first, marks), (second, _) = load_rollouts(tmp_path / "r.npz")
     np.testing.assert_array_equal(marks["mark"], np.arange(3))
     assert same(render_clip(first), simulate_clip(9, **settings))
     assert render_clip(second).name == "simulated_8"
@@ -61,29 +65,29 @@ def test_a_recording_films_the_same_clip_bit_for_bit(tmp_path, settings):
 
 def test_stereo_is_recorded_too():
     settings = {"frames": 2, "size": (32, 32), "tracks": 5, "stereo_baseline": 0.2}
-    one, two = render_clip(record(1, **settings)), simulate_clip(1, **settings)
+    one, two = render_clip(simulate_rollout(1, **settings)), simulate_clip(1, **settings)
     np.testing.assert_array_equal(one.extras["video_right"], two.extras["video_right"])
 
 
 def test_filming_needs_no_physics(monkeypatch):
-    recording = record(5, frames=3, size=(32, 32), tracks=10)
-    expected = render_clip(recording)
+    rollout = simulate_rollout(5, frames=3, size=(32, 32), tracks=10)
+    expected = render_clip(rollout)
     monkeypatch.setattr(simulator, "roll_out", lambda *_: pytest.fail("physics was computed"))
-    assert same(render_clip(recording), expected)
-    moved = replace(recording, states=recording.states + 0.05)
+    assert same(render_clip(rollout), expected)
+    moved = replace(rollout, states=rollout.states + 0.05)
     assert not np.array_equal(render_clip(moved).video, expected.video)
 
 
 def test_a_recording_of_another_scene_is_refused():
-    recording = record(5, frames=2, size=(32, 32), tracks=10)
+    rollout = simulate_rollout(5, frames=2, size=(32, 32), tracks=10)
     with pytest.raises(ValueError, match="another version of the simulator"):
-        render_clip(replace(recording, states=recording.states[..., :-7]))
+        render_clip(replace(rollout, states=rollout.states[..., :-7]))
 
 
 def test_a_file_without_recordings_is_refused(tmp_path):
     np.savez(tmp_path / "x.npz", video=np.zeros(3))
-    with pytest.raises(ValueError, match="not a file of recordings"):
-        load_recordings(tmp_path / "x.npz")
+    with pytest.raises(ValueError, match="not a file of rollouts"):
+        load_rollouts(tmp_path / "x.npz")
 
 
 # --- what is stored -------------------------------------------------------------------------------------------------
@@ -103,19 +107,19 @@ def test_seeds_are_kept_apart(monkeypatch, tmp_path):
 
 
 def test_stored_splits_are_what_they_claim_and_small():
-    stored = {split: load_recordings(FOLDER / f"{split}.npz") for split in SPLITS}
-    used = [recording.seed for part in stored.values() for recording, _ in part]
+    stored = {split: load_rollouts(FOLDER / f"{split}.npz") for split in SPLITS}
+    used = [rollout.seed for part in stored.values() for rollout, _ in part]
     assert len(set(used)) == 48 and set(used) <= set(seeds.BENCHMARK)
     assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 1.5e6
     for split, part in stored.items():
         first = [lite_splits.split_seed(split, 0) + index for index in range(16)]
-        assert [recording.seed for recording, _ in part] == first  # blindly the first ones, none left out
-        for index, (recording, _) in enumerate(part):
-            config = recording.config
+        assert [rollout.seed for rollout, _ in part] == first  # blindly the first ones, none left out
+        for index, (rollout, _) in enumerate(part):
+            config = rollout.config
             assert config == lite_splits.split_config(split, index)
             assert (config.frames, config.fps, config.size, config.tracks) == (24, 12.0, (128, 128), 256)
-            assert recording.states.dtype == np.float64 and recording.states.shape[:2] == (24, 1)
-            moves = np.abs(np.diff(recording.extrinsics, axis=0)).max()
+            assert rollout.states.dtype == np.float64 and rollout.states.shape[:2] == (24, 1)
+            moves = np.abs(np.diff(rollout.extrinsics, axis=0)).max()
             assert (moves > 0) == (config.camera != "static")
     assert {r.config.camera for r, _ in stored["moving-camera"]} == {"linear", "arc", "handheld"}
     assert all(r.config.occluder for r, _ in stored["occlusion"])
@@ -125,9 +129,9 @@ def test_occlusions_occur():
     share = {}
     for split in SPLITS:
         dynamic, gaps = [], []
-        for recording, marks in load_recordings(FOLDER / f"{split}.npz"):
+        for rollout, marks in load_rollouts(FOLDER / f"{split}.npz"):
             visible = np.unpackbits(marks["visible"])[: 24 * 256].reshape(24, 256).astype(bool)
-            on_moving = round(256 * recording.config.share_dynamic)
+            on_moving = round(256 * rollout.config.share_dynamic)
             gaps.append((longest_gap(visible) >= 6).sum())
             dynamic.append(on_moving)
         share[split] = sum(gaps) / sum(dynamic)
@@ -137,41 +141,41 @@ def test_occlusions_occur():
 
 def test_a_stored_clip_films_as_stored(tmp_path):
     (clip,) = benchmark_clips("occlusion", 1, tmp_path, workers=1, progress=False)
-    (recording, marks), (_, others) = load_recordings(FOLDER / "occlusion.npz")[:2]
+    (rollout, marks), (_, others) = load_rollouts(FOLDER / "occlusion.npz")[:2]
     assert not differences(clip, marks) and differences(clip, others)
-    assert clip.name == "occlusion-00" and len(clip) == 24 and recording.config.occluder
+    assert clip.name == "occlusion-00" and len(clip) == 24 and rollout.config.occluder
 
 
 @pytest.fixture
-def two_recordings(tmp_path, small):
+def two_rollouts(tmp_path, small):
     """Options for a benchmark of the two small clips, with a cache of its own."""
-    recordings = [record(s, frames=4, size=(48, 48), tracks=24) for s in (3, 4)]
-    save_recordings(tmp_path / "static-camera.npz", recordings, [fingerprint(clip) for clip in small])
+    rollouts = [simulate_rollout(s, frames=4, size=(48, 48), tracks=24) for s in (3, 4)]
+    save_rollouts(tmp_path / "static-camera.npz", rollouts, [fingerprint(clip) for clip in small])
     return {"cache": tmp_path / "cache", "progress": False, "folder": tmp_path}
 
 
-def test_clips_are_filmed_once_and_checked(two_recordings, monkeypatch, small):
-    cache, filmed = two_recordings["cache"], []
+def test_clips_are_filmed_once_and_checked(two_rollouts, monkeypatch, small):
+    cache, filmed = two_rollouts["cache"], []
     cache.mkdir()
     (cache / "static-camera-00-0123456789ab.npz").write_bytes(b"an older version")
-    assert all(map(same, benchmark_clips("static-camera", workers=2, **two_recordings), small))
+    assert all(map(same, benchmark_clips("static-camera", workers=2, **two_rollouts), small))
     assert len(list(cache.iterdir())) == 2  # and the older version is gone
     monkeypatch.setattr(lite_splits, "render_clip", lambda r: filmed.append(r.seed) or render_clip(r))
-    assert same(benchmark_clips("static-camera", **two_recordings)[1], small[1])
+    assert same(benchmark_clips("static-camera", **two_rollouts)[1], small[1])
     assert not filmed
     damaged = next(cache.glob("static-camera-01*"))
     damaged.write_bytes(damaged.read_bytes()[:5000])
-    assert same(benchmark_clips("static-camera", workers=1, **two_recordings)[1], small[1])
+    assert same(benchmark_clips("static-camera", workers=1, **two_rollouts)[1], small[1])
     small[1].save(next(cache.glob("static-camera-00*")))  # a sound file of another clip
-    assert same(benchmark_clips("static-camera", 1, workers=1, **two_recordings)[0], small[0])
+    assert same(benchmark_clips("static-camera", 1, workers=1, **two_rollouts)[0], small[0])
     assert filmed == [4, 3]
 
 
-def test_another_renderer_is_noticed(two_recordings, monkeypatch, small):
+def test_another_renderer_is_noticed(two_rollouts, monkeypatch, small):
     monkeypatch.setattr(lite_splits, "render_clip", lambda _: replace(small[0], video=255 - small[0].video))
     with pytest.raises(ValueError, match=r"static-camera-00.*video: .*not be comparable"):
-        benchmark_clips("static-camera", workers=1, **two_recordings)
-    assert not list(two_recordings["cache"].glob("*"))
+        benchmark_clips("static-camera", workers=1, **two_rollouts)
+    assert not list(two_rollouts["cache"].glob("*"))
 
 
 def test_fingerprints_forgive_rounding_and_nothing_else(small):

@@ -1,4 +1,4 @@
-"""The command line and run.py, as a user calls them."""
+"""The command line, as a user calls it."""
 
 import os
 import subprocess
@@ -33,18 +33,8 @@ def clip_file(tmp_path_factory):
 
 
 def test_track_writes_result_page_and_picture(clip_file, tmp_path):
-    result = call(
-        "track",
-        clip_file,
-        "--tracker",
-        "klt",
-        "--out",
-        tmp_path / "o.npz",
-        "--html",
-        tmp_path / "o.html",
-        "--png",
-        tmp_path / "o.png",
-    )
+    written = ("--out", tmp_path / "o.npz", "--html", tmp_path / "o.html", "--png", tmp_path / "o.png")
+    result = call("track", clip_file, "--tracker", "klt", *written)
     assert result.returncode == 0, result.stderr
     assert "AJ3D" in result.stdout and "20 points over 6 frames" in result.stdout
     tracks = t3d.load_tracks(tmp_path / "o.npz")
@@ -77,8 +67,11 @@ def test_evaluate_prints_a_table_with_means(clip_file):
         (["track", "CLIP", "--tracker", "nonsense"], "no tracker 'nonsense'"),
         (["track", "CLIP", "--no-own-queries", "--grid", "0"], "grid_queries"),
         (["simulate", "--out", "x", "--count", "0"], "count"),
-        (["picture", "PLAIN"], "no true tracks"),
         (["evaluate", "PLAIN"], "no true tracks"),
+        (["check", "absent.npz"], "no such file"),
+        (["import", "absent.pth", "out.safetensors"], "no such file"),
+        (["card", "absent", "results.json", "--hardware", "x"], "not a finished training"),
+        (["curves", "absent"], "absent"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(clip_file, tmp_path, arguments, message):
@@ -91,7 +84,7 @@ def test_bad_input_is_one_line_and_exit_code_2(clip_file, tmp_path, arguments, m
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_gpu_that_is_not_there_is_told_before_clips_are_simulated(tmp_path):
+def test_a_missing_gpu_is_an_error_before_clips_are_simulated(tmp_path):
     result = call("train", "--out", tmp_path / "run", "--device", "cuda")
     assert result.returncode == 2 and "no CUDA device; leave --device out" in result.stderr
     assert not (tmp_path / "run").exists()
@@ -127,50 +120,3 @@ def test_simulate_writes_and_resumes(tmp_path):
     assert call(*options, "--count", "3").returncode == 0
     assert len(sorted(tmp_path.glob("*.npz"))) == 3
     assert [p.stat().st_mtime_ns for p in first] == before
-
-
-def test_run_py_explains_itself_without_installing():
-    result = subprocess.run([sys.executable, str(ROOT / "run.py"), "--help"], capture_output=True, text=True)
-    assert result.returncode == 0
-    assert all(word in result.stdout for word in ("setup", "lab", "test", "demo", "notebooks"))
-    for wrong in (["fly"], ["setup", "--fast"]):
-        assert subprocess.run([sys.executable, str(ROOT / "run.py"), *wrong], capture_output=True).returncode == 2
-
-
-def test_run_py_passes_options_on(monkeypatch):
-    sys.path.insert(0, str(ROOT))
-    try:
-        import run
-    finally:
-        sys.path.remove(str(ROOT))
-    calls = []
-    monkeypatch.setattr(run, "setup", lambda: None)
-    monkeypatch.setattr(run, "_call", lambda *arguments: calls.append(arguments) or 0)
-    for line in (
-        "run.py test -k cut --maxfail=1",
-        "run.py lab --no-browser --port 9000",
-        "run.py demo clip.npz",
-        "run.py test",
-    ):
-        monkeypatch.setattr(sys, "argv", line.split())
-        assert run.main() == 0
-    assert calls[0] == ("-m", "pytest", "-k", "cut", "--maxfail=1")
-    assert calls[1][-3:] == ("--no-browser", "--port", "9000")
-    assert calls[2] == ("-m", "tapip3d_lite", "demo", "clip.npz")
-    assert len(calls) == 5  # all tests: unit tests, then notebooks
-
-
-def test_run_py_tries_a_browser_only_when_asked(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT))
-    import run
-
-    calls = []
-    monkeypatch.setenv("TAPIP3D_BROWSER", "")  # so that it is put back afterwards
-    monkeypatch.delenv("TAPIP3D_BROWSER")
-    monkeypatch.setattr(
-        run, "_call", lambda *arguments: calls.append((arguments, "TAPIP3D_BROWSER" in os.environ)) or 0
-    )
-    assert run.run_test() == 0 and not any(asked for _, asked in calls)
-    assert run.run_test("--browser") == 0
-    assert [arguments[1] for arguments, _ in calls] == ["pytest"] * 2 + ["pip"] + ["pytest"] * 2
-    assert all("--browser" not in arguments for arguments, _ in calls) and all(asked for _, asked in calls[3:])

@@ -8,12 +8,12 @@ from lessons.n03 import RIGHT, WRONG, Around, neighborhoods_3d, proof_view, shar
 from lessons.n03_cells import Cells, silhouettes, track_objects
 from lessons.n03_exercises import search, walls
 from tapip3d_lite.geometry import point_map, project
-from tapip3d_lite.simulate import object_maps, record, render_clip
+from tapip3d_lite.simulate import object_maps, render_clip, simulate_rollout
 
 
 @pytest.fixture(scope="module")
 def filmed():
-    recording = record(3, frames=4, size=(48, 64), sky=True, tracks=60)
+    recording = simulate_rollout(3, frames=4, size=(48, 64), sky=True, tracks=60)
     return render_clip(recording), object_maps(recording)
 
 

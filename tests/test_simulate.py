@@ -7,10 +7,10 @@ from lessons import samples
 from tapip3d_lite.clip import load_clip
 from tapip3d_lite.geometry import project, unproject
 from tapip3d_lite.simulate import SimulationConfig, simulate_clip, simulate_dataset, simulator
+from tapip3d_lite.simulate.bodies import random_scene
 from tapip3d_lite.simulate.cameras import random_path
-from tapip3d_lite.simulate.config import CAMERAS, SHAPES
 from tapip3d_lite.simulate.physics import UnstableSceneError, geom_poses, roll_out
-from tapip3d_lite.simulate.scene import random_scene
+from tapip3d_lite.simulate.settings import CAMERAS, SHAPES
 from tapip3d_lite.simulate.tracks import point_visibility, sample_pixels
 
 SMALL = {"frames": 6, "size": (64, 64)}

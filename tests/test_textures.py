@@ -1,6 +1,5 @@
-"""Solid textures and toy meshes: in range, smooth, distinct, fast; closed, outward, small, compiled by MuJoCo."""
+"""Solid textures and toy meshes: in range, smooth, distinct; closed, outward, small, compiled by MuJoCo."""
 
-import time
 from collections import Counter
 
 import mujoco
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 
 from tapip3d_lite.simulate.meshes import MESHES
-from tapip3d_lite.simulate.textures import KINDS, Texture, random_sky, random_texture, sky
+from tapip3d_lite.simulate.textures import KINDS, Texture, random_sky, random_texture
 
 
 def points(count=4096, reach=0.6, seed=0):
@@ -90,31 +89,18 @@ def test_repeated_cells_differ():
         assert min(np.abs(texture.color(p + np.array(s)) - base).mean() for s in shifts[::3]) > 0.015
 
 
-def test_textures_are_fast():
-    p = points(16384)
-    textures = [random_texture(np.random.default_rng(1), kind) for kind in KINDS]
-    best = []
-    for texture in textures:
-        times = []
-        for _ in range(3):
-            start = time.perf_counter()
-            texture.color(p)
-            times.append(time.perf_counter() - start)
-        best.append(min(times))
-    assert np.mean(best) * 24 < 5 * 0.12, "24 frames of 128 x 128 should take about 0.04 s"
-
-
 def test_sky_is_soft_and_lighter_than_the_ground():
     rng = np.random.default_rng(0)
     d = rng.normal(size=(5000, 3))
     d /= np.linalg.norm(d, axis=-1, keepdims=True)
     for _ in range(6):
         drawn = random_sky(rng)
-        color = sky(d, drawn)
+        color = drawn.color(d)
         assert color.dtype == np.float32 and color.min() >= 0 and color.max() <= 1
         assert color[d[:, 2] > 0.05].mean() > color[d[:, 2] < -0.1].mean()
         assert np.abs(drawn.color(d + 1e-3) - color).max() < 0.06
-    np.testing.assert_array_equal(sky(d, np.random.default_rng(1)), sky(d, np.random.default_rng(1)))
+    first, again = (random_sky(np.random.default_rng(1)).color(d) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
 
 
 def corners(mesh):

@@ -1,12 +1,13 @@
-"""Trackers without learning, to compare with: zero motion, and pyramidal Lucas-Kanade lifted by depth.
+"""Baselines without learning: zero motion, and pyramidal Lucas-Kanade lifted by depth.
 
-Both take the arguments of the learnt tracker's `track`, so that one call serves all; those that concern the model
-alone (`space`, `iterations`, `support_grid`, `depth_roi`, `visible_threshold`) have no meaning here and change nothing.
+Both take the same arguments as the learnt tracker's `track`. Those that concern only the model (`space`, `iterations`,
+`support_grid`, `depth_roi`, `visible_threshold`) are accepted and ignored.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -16,15 +17,33 @@ from tapip3d_lite.geometry import project, unproject
 from tapip3d_lite.queries import resolve_queries
 
 
+class TrackerLike(Protocol):
+    """The interface that all trackers share, learnt or not."""
+
+    def track(
+        self,
+        clip: Clip,
+        queries: np.ndarray | None = None,
+        space: str | None = None,
+        iterations: int | None = None,
+        support_grid: int | None = None,
+        bidirectional: bool = True,
+        depth_roi: str | tuple[float, float] | None = "auto",
+        visible_threshold: float | None = None,
+        progress: bool = False,
+    ) -> Tracks:
+        """3D tracks of `queries` (N, 4), of the clip's own queries, or of a grid on the first frame."""
+
+
 @dataclass(frozen=True)
 class StaticTracker:
-    """Nothing moves in the world: every point stays at its query.
+    """Zero motion in the world: every point stays at its query.
 
     A point counts as visible where it projects inside the image and the depth map shows a surface there, neither in
     front of it (it is hidden) nor behind it (whatever the query lay on has moved away).
 
     Attributes:
-        slack: relative depth difference up to which the surface at the pixel still is the point.
+        slack: relative depth difference up to which the surface at the pixel counts as the point.
     """
 
     slack: float = 0.02
@@ -41,7 +60,7 @@ class StaticTracker:
         visible_threshold: float | None = None,
         progress: bool = False,
     ) -> Tracks:
-        """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid; the rest changes nothing."""
+        """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid; other options are ignored."""
         queries = resolve_queries(clip, queries)
         xyz = np.repeat(queries[None, :, 1:], len(clip), 0)
         uv, z = project(xyz, clip.intrinsics, clip.extrinsics)
@@ -85,8 +104,8 @@ class KltTracker:
     ) -> Tracks:
         """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid.
 
-        With `bidirectional=False` a point stands still and counts as hidden before its query; the rest of the
-        options changes nothing.
+        With `bidirectional=False` a point stands still and counts as hidden before its query; other options are
+        ignored.
         """
         paths = _Paths(clip, resolve_queries(clip, queries))
         for step in (1, -1) if bidirectional else (1,):
@@ -100,14 +119,14 @@ class KltTracker:
         camera = paths.clip.intrinsics[t], paths.clip.extrinsics[t]
         still, z = project(paths.world[last, np.arange(len(last))], *camera)
         surface, inside = _nearest_depth(paths.clip, t, still, z)
-        # A point that was lost can be back only where a surface is at its depth; one just seen may have moved off.
+        # A lost point can reappear only where a surface has its depth; a point seen in the last frame may have moved.
         possible = begun & (z > 0) & ((last == t - 1) | (last == t + 1) | (inside & self._same(surface, z)))
         for origin in np.unique(last[possible]):
             which = np.flatnonzero(possible & (last == origin))
             there, returned = self._flow(paths, origin, t, which, still[which])
             depth, inside = _nearest_depth(paths.clip, t, there, z[which])
             kept = returned & inside & self._same(depth, z[which])
-            if abs(origin - t) > 1:  # after a gap only a small correction is trusted: the best match may be a stranger
+            if abs(origin - t) > 1:  # after a gap a large correction is more often another point than this one
                 kept &= np.linalg.norm(there - still[which], axis=-1) <= 2 * self.tolerance
             found = which[kept]
             paths.uv[t, found], paths.seen[t, found], last[found] = there[kept], True, t
@@ -122,7 +141,7 @@ class KltTracker:
         }
         here, guess = paths.uv[a, which], guess.astype(np.float32)
         there, out, _ = cv2.calcOpticalFlowPyrLK(paths.gray[a], paths.gray[b], here, guess.copy(), **options)
-        # The way back starts off by as much as the way there ended off its guess, so that it proves something.
+        # The backward search starts as far from its target as the forward search did, else it would return trivially.
         back, home, _ = cv2.calcOpticalFlowPyrLK(paths.gray[b], paths.gray[a], there, here + (there - guess), **options)
         returned = np.linalg.norm(back - here, axis=-1) <= self.tolerance
         return there, out[:, 0].astype(bool) & home[:, 0].astype(bool) & returned
@@ -132,7 +151,7 @@ class KltTracker:
 
 
 class _Paths:
-    """What is known so far: pixels `uv` (T, N, 2), `world` (T, N, 3) and `seen` (T, N), from the queries outward."""
+    """The tracks found so far: pixels `uv` (T, N, 2), `world` (T, N, 3) and `seen` (T, N), from the queries outward."""
 
     def __init__(self, clip: Clip, queries: np.ndarray) -> None:
         shape = len(clip), len(queries)

@@ -1,6 +1,6 @@
-"""The Lite benchmark: score trackers on clips that no training has seen, and say how sure the means are.
+"""The Lite benchmark: scores of trackers on clips that no training has seen, with confidence intervals of the means.
 
-Results are nested dictionaries, `results[label][split][clip][metric]`, so that they go to JSON as they are.
+Results are nested dictionaries, `results[label][split][clip][metric]`, which JSON can hold as they are.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
 
 from tqdm import tqdm
 
-from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.evaluation.baselines import TrackerLike
 from tapip3d_lite.evaluation.evaluate import evaluate
 from tapip3d_lite.evaluation.intervals import Estimate, bootstrap_interval, paired_difference
 from tapip3d_lite.evaluation.lite_splits import COUNT, FOLDER, SPLITS, benchmark_clips, check_split
-from tapip3d_lite.files import atomic_path
+from tapip3d_lite.files import write_text
 
 __all__ = [
     "METRICS",
@@ -39,15 +39,8 @@ Results = dict[str, SplitScores]  # label → …
 METRICS = ("AJ3D_none", "APD3D_none", "AJ3D", "APD3D", "OA")
 
 
-class Trackable(Protocol):
-    """Whatever can be scored."""
-
-    def track(self, clip: Clip, **options: Any) -> Tracks:
-        """Tracks of the clip's own queries, in their order."""
-
-
 def run_benchmark(
-    tracker: Trackable,
+    tracker: TrackerLike,
     splits: Sequence[str] = SPLITS,
     count: int | None = None,
     done: SplitScores | None = None,
@@ -60,14 +53,14 @@ def run_benchmark(
     """Track and score the clips of some splits.
 
     Args:
-        tracker: anything with `track`.
+        tracker: any object with a method `track`.
         splits: some of `SPLITS`.
         count: only the first so many clips of each split.
-        done: scores of an earlier, interrupted run; its clips are not tracked again, new ones are added to it.
-        on_clip: called with all scores so far after every clip, e.g. to save them.
-        cache: folder of the filmed clips, see `benchmark_clips`.
+        done: scores of an earlier, interrupted run; their clips are not tracked again, new scores are added in place.
+        on_clip: called after every clip with all scores so far, e.g. to save them.
+        cache: folder for the rendered clips (1 MB each); under the user's cache folder if None.
         progress: show bars.
-        desc: what the bar says.
+        desc: label of the bar.
         track_options: passed to `track`, e.g. `space="camera"`.
 
     Returns:
@@ -92,12 +85,12 @@ def run_benchmark(
     return scores
 
 
-def _score(tracker: Trackable, clip: Clip, options: Mapping[str, object]) -> dict[str, float]:
+def _score(tracker: TrackerLike, clip: Clip, options: Mapping[str, object]) -> dict[str, float]:
     return evaluate(tracker.track(clip, **options), clip)
 
 
 def version_of(tracker: object, options: Mapping[str, object]) -> str:
-    """A short digest of what decides scores: the benchmark's clips, a tracker's settings and weights, options."""
+    """A short digest of everything that scores depend on: the benchmark's clips, a tracker's settings, weights, options."""
     digest = hashlib.sha256()
     for split in SPLITS:
         digest.update((FOLDER / f"{split}.npz").read_bytes())
@@ -109,20 +102,19 @@ def version_of(tracker: object, options: Mapping[str, object]) -> str:
 
 
 def save_results(path: str | Path, results: Results, versions: Mapping[str, str | None] | None = None) -> None:
-    """Write results as JSON, atomically; `versions` tell by label what they were made with (`version_of`)."""
+    """Write results as JSON, atomically; `versions` holds each label's digest from `version_of`."""
     rows = {
         label: {"version": (versions or {}).get(label), "scores": _map(scores, lambda x: None if math.isnan(x) else x)}
         for label, scores in results.items()
     }
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(rows, indent=1) + "\n")
 
 
 def load_results(path: str | Path) -> tuple[Results, dict[str, str | None]]:
-    """Read what `save_results` wrote: results, and by label what they were made with.
+    """Read what `save_results` wrote: results, and the digest of each label.
 
     Raises:
-        ValueError: missing or not such a file.
+        ValueError: the file is missing or holds something else.
     """
     try:
         rows = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -137,7 +129,7 @@ def _map(scores: dict, change: Callable) -> dict:
 
 
 def column(results: Results, label: str, split: str, metric: str) -> list[float]:
-    """One score a clip, in the clips' order; NaN where a clip lacks it.
+    """One score for each clip, in the order of their names; NaN where a clip lacks it.
 
     Raises:
         ValueError: no such label or split.

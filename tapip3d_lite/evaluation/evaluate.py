@@ -1,4 +1,4 @@
-"""Score tracks against a clip's truth, the way the benchmarks do."""
+"""Scores of tracks against a clip's ground truth, as the benchmarks define them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.evaluation.metrics import scale_factor, tapvid2d_metrics, tapvid3d_metrics
-from tapip3d_lite.geometry import project, transform
-
-RASTER = 256  # both benchmarks measure pixels on an image of this size
+from tapip3d_lite.geometry import RASTER, project, transform
 
 
 def evaluate(pred: Tracks, clip: Clip, truth: Tracks | None = None) -> dict[str, float]:
@@ -23,7 +21,7 @@ def evaluate(pred: Tracks, clip: Clip, truth: Tracks | None = None) -> dict[str,
 
     Args:
         pred: tracks of the truth's queries, in their order.
-        clip: gives the cameras, and the truth where none is given.
+        clip: provides the cameras, and the truth unless one is given.
         truth: in place of `clip.tracks`, e.g. `clip.tracks.select(mask)`.
 
     Returns:

@@ -1,4 +1,4 @@
-"""How sure a mean over clips is: bootstrap intervals, and differences between trackers on the same clips."""
+"""Bootstrap confidence intervals of means over clips, and of differences between trackers on the same clips."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def bootstrap_interval(values: ArrayLike, n: int = 10_000, level: float = 0.95, 
     """Mean over clips with its percentile bootstrap interval.
 
     Args:
-        values: (C,) one score a clip; NaN marks clips where it is undefined and is left out.
+        values: (C,) one score for each clip; NaN marks clips where it is undefined and is left out.
         n: resamples.
         level: share of the resampled means inside the interval.
-        seed: of the resampling.
+        seed: of the random generator that resamples.
 
     Returns:
         Mean, low and high; low and high are NaN for fewer than two values, all three for none.
@@ -45,9 +45,9 @@ def bootstrap_interval(values: ArrayLike, n: int = 10_000, level: float = 0.95, 
 
 
 def paired_difference(ours: ArrayLike, theirs: ArrayLike, n: int = 10_000, seed: int = 0) -> Estimate:
-    """Mean of ours - theirs on the same clips with its 95 % interval; it counts where both are defined.
+    """Mean of ours - theirs with its 95 % interval, over clips where both are defined.
 
-    Pairing takes out that some clips are harder than others for everyone.
+    Pairing removes the variance between easy and hard clips, which both trackers share.
     """
     ours, theirs = np.asarray(ours, float), np.asarray(theirs, float)
     if ours.shape != theirs.shape:

@@ -1,15 +1,13 @@
-"""The Lite benchmark's clips: three splits that are stored as roll-outs, filmed here, and checked against fingerprints.
+"""The clips of the Lite benchmark: three splits, stored as rollouts, rendered on first use and compared with fingerprints.
 
-The files beside this module hold what physics produced, so that every machine scores the same clips; each clip's
-fingerprint tells when a change of the renderer would silently change them.
+The files in `lite_benchmark/` hold the results of the physics, so that every machine scores the same clips; each clip's
+fingerprint reveals a change of the renderer that would silently change the scores.
 """
 
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -18,9 +16,9 @@ import numpy as np
 from tqdm import tqdm
 
 from tapip3d_lite.clip import Clip, load_clip
-from tapip3d_lite.processes import leave_interrupts
-from tapip3d_lite.simulate import Recording, SimulationConfig, record, render_clip
-from tapip3d_lite.simulate.recording import load_recordings, save_recordings
+from tapip3d_lite.simulate import Rollout, SimulationConfig, render_clip, simulate_rollout
+from tapip3d_lite.simulate.dataset import run_jobs
+from tapip3d_lite.simulate.rollout import load_rollouts, save_rollouts
 from tapip3d_lite.simulate.seeds import BENCHMARK
 
 FOLDER = Path(__file__).parent / "lite_benchmark"
@@ -61,15 +59,15 @@ def check_split(split: str) -> None:
 
 
 def write_split(split: str, folder: str | Path = FOLDER, count: int = COUNT) -> Path:
-    """Simulate a split anew and store it; the scores of the benchmark change with it, so this is for its makers only."""
-    recordings = [record(split_seed(split, index), split_config(split, index)) for index in range(count)]
+    """Simulate a split again and store it, for maintainers only: the benchmark's scores change with it."""
+    rollouts = [simulate_rollout(split_seed(split, index), split_config(split, index)) for index in range(count)]
     path = Path(folder) / f"{split}.npz"
-    save_recordings(path, recordings, [fingerprint(render_clip(recording)) for recording in recordings])
+    save_rollouts(path, rollouts, [fingerprint(render_clip(rollout)) for rollout in rollouts])
     return path
 
 
 def fingerprint(clip: Clip) -> dict[str, np.ndarray]:
-    """A few thousand numbers by which to tell a clip from another: tracks and depth in millimetres, colours, visibility."""
+    """A few thousand numbers that identify a clip: tracks and depths in millimetres, colours, visibility."""
     some = (slice(None, None, 8), slice(4, None, 8), slice(4, None, 8))
     return {
         "tracks": np.rint(1000 * clip.tracks.xyz[::8, ::2]).astype(np.int16),
@@ -80,7 +78,7 @@ def fingerprint(clip: Clip) -> dict[str, np.ndarray]:
 
 
 def differences(clip: Clip, stored: dict[str, np.ndarray], share: float = 0.01) -> list[str]:
-    """What of a clip is not as in a fingerprint, up to rounding and a share of values on edges of bodies."""
+    """What differs between a clip and a fingerprint, apart from rounding and a share of pixels at edges of bodies."""
     found = []
     for name, now in fingerprint(clip).items():
         if now.shape != stored[name].shape:
@@ -100,47 +98,48 @@ def benchmark_clips(
     progress: bool = True,
     folder: str | Path = FOLDER,
 ) -> list[Clip]:
-    """The clips of a split, named `<split>-<index>`; filmed when first asked for, then read from a cache.
+    """The clips of a split, named `<split>-<index>`; rendered on first use, then read from a cache.
 
     A script that calls this with several workers needs the usual `if __name__ == "__main__":`.
 
     Args:
         split: one of `SPLITS`.
         count: only the first so many clips.
-        cache: folder for the filmed clips (1 MB each); `cache_folder()` if None.
+        cache: folder for the rendered clips (1 MB each); `cache_folder()` if None.
         workers: processes; None for one per core.
-        progress: show a bar while filming.
-        folder: where the stored roll-outs lie.
+        progress: show a bar while rendering.
+        folder: of the stored rollouts.
 
     Raises:
-        ValueError: unknown split, bad count, or this renderer films something else than what was stored.
+        ValueError: unknown split, bad count, or rendered clips that differ from the fingerprints.
     """
     check_split(split)
     if count is not None and count < 1:
         raise ValueError(f"benchmark_clips: count must be at least 1, got {count}; leave it out for all clips")
     path, cache = Path(folder) / f"{split}.npz", Path(cache or cache_folder())
-    stored, key = load_recordings(path)[:count], _key(path)
+    stored, key = load_rollouts(path)[:count], _key(path)
     jobs = [
-        (cache / f"{split}-{index:02d}-{key}.npz", f"{split}-{index:02d}", recording, marks)
-        for index, (recording, marks) in enumerate(stored)
+        (cache / f"{split}-{index:02d}-{key}.npz", f"{split}-{index:02d}", rollout, marks)
+        for index, (rollout, marks) in enumerate(stored)
     ]
     clips = {job[1]: _cached(job) for job in jobs}
     missing = [job for job in jobs if clips[job[1]] is None]
-    for name in _film(missing, workers or os.cpu_count() or 1, progress):
-        clips[name] = None
+    with tqdm(total=len(missing), desc="rendering", unit="clip", disable=not (progress and missing)) as bar:
+        for _ in run_jobs(_render, missing, workers):
+            bar.update()
     return [clips[job[1]] or load_clip(job[0]) for job in jobs]
 
 
 def cache_folder() -> Path:
-    """Where filmed clips are kept: `$XDG_CACHE_HOME/tapip3d_lite/benchmark`, by default under `~/.cache`."""
+    """The folder of rendered clips: `$XDG_CACHE_HOME/tapip3d_lite/benchmark`, by default under `~/.cache`."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tapip3d_lite" / "benchmark"
 
 
-Job = tuple[Path, str, Recording, dict[str, np.ndarray]]
+Job = tuple[Path, str, Rollout, dict[str, np.ndarray]]
 
 
 def _key(path: Path) -> str:
-    """What the cached clips depend on: the stored roll-outs, the renderer's source, and what it computes with."""
+    """A digest of everything that cached clips depend on: rollouts, the renderer's source, versions of its packages."""
     sources = sorted((Path(__file__).parents[1] / "simulate").glob("*.py"))
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in (path, *sources)))
     digest.update(f"{version('mujoco')} {version('numpy')}".encode())
@@ -148,7 +147,7 @@ def _key(path: Path) -> str:
 
 
 def _cached(job: Job) -> Clip | None:
-    """The clip from the cache, or None where it is absent, damaged or not what was stored."""
+    """The clip from the cache, or None where it is absent, damaged or differs from its fingerprint."""
     try:
         clip = load_clip(job[0])
     except ValueError:
@@ -156,31 +155,17 @@ def _cached(job: Job) -> Clip | None:
     return clip if clip.tracks is not None and not differences(clip, job[3]) else None
 
 
-def _film(jobs: list[Job], workers: int, progress: bool) -> Iterator[str]:
-    """Film clips into the cache and tell the name of each when it is there."""
-    with tqdm(total=len(jobs), desc="filming", unit="clip", disable=not (progress and jobs)) as bar:
-        if min(workers, len(jobs)) > 1:
-            with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs)), leave_interrupts) as pool:
-                for name in pool.imap_unordered(_film_one, jobs):
-                    bar.update()
-                    yield name
-        else:
-            for job in jobs:
-                yield _film_one(job)
-                bar.update()
-
-
-def _film_one(job: Job) -> str:
-    path, name, recording, marks = job
-    clip = replace(render_clip(recording), name=name)
+def _render(job: Job) -> None:
+    """Render one clip into the cache."""
+    path, name, rollout, marks = job
+    clip = replace(render_clip(rollout), name=name)
     wrong = differences(clip, marks)
     if wrong:
         raise ValueError(
-            f"benchmark clip {name}: what is filmed here is not what the benchmark holds ({'; '.join(wrong)}); "
+            f"benchmark clip {name}: the clip rendered here is not the benchmark's ({'; '.join(wrong)}); "
             "scores would not be comparable; use the versions of mujoco and tapip3d_lite that the benchmark was made with"
         )
     clip.save(path)
-    for old in path.parent.glob(f"{name}-*.npz"):  # filmed by an earlier version
+    for old in path.parent.glob(f"{name}-*.npz"):  # rendered by an earlier version
         if old != path:
             old.unlink(missing_ok=True)
-    return name

@@ -1,7 +1,7 @@
 """The field's metrics: TAPVid-3D (AJ, APD, OA in 3D) and TAP-Vid (the same in the image).
 
-Both count, for thresholds of k = 1, 2, 4, 8, 16 pixels, how often a visible true point is hit and how often "visible"
-is claimed rightly. In 3D a pixel is a length: k p_z / sqrt(fx fy) at the true depth p_z.
+Both count, for thresholds of k = 1, 2, 4, 8, 16 pixels, how often a visible true point is hit and how often visibility
+is predicted correctly. In 3D a pixel is a length: k p_z / sqrt(fx fy) at the true depth p_z.
 
     OA    = mean [V = W]
     APD_k = sum(inside V) / sum(V)
@@ -17,9 +17,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-Array = np.ndarray
+from tapip3d_lite.geometry import THRESHOLDS
 
-THRESHOLDS = (1, 2, 4, 8, 16)
+Array = np.ndarray
 SCALINGS = ("median", "mean", "none", "per_trajectory", "reproduce_2d", "median_on_queries")
 MODES = ("first", "strided")
 

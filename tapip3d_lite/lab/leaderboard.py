@@ -1,4 +1,4 @@
-"""Trackers by name on the Lite benchmark: what `python -m tapip3d_lite benchmark` runs."""
+"""Scores of trackers by name on the Lite benchmark, for `python -m tapip3d_lite benchmark`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker
+from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker, TrackerLike
 from tapip3d_lite.evaluation.benchmark import SPLITS, Results, load_results, run_benchmark, save_results, version_of
-from tapip3d_lite.trackers import TrackerLike, load_tracker
+from tapip3d_lite.trackers import load_tracker
 
 
 def score_trackers(

@@ -1,10 +1,18 @@
-"""Small Kubric-like clips with exact truth: MuJoCo throws the bodies, ray casting gives colour, depth and visibility."""
+"""Small Kubric-like clips with exact ground truth: MuJoCo's physics and ray casting."""
 
 from __future__ import annotations
 
-from tapip3d_lite.simulate.config import SimulationConfig
 from tapip3d_lite.simulate.dataset import simulate_dataset
-from tapip3d_lite.simulate.recording import Recording
-from tapip3d_lite.simulate.simulator import object_maps, record, render_clip, simulate_clip
+from tapip3d_lite.simulate.rollout import Rollout
+from tapip3d_lite.simulate.settings import SimulationConfig
+from tapip3d_lite.simulate.simulator import object_maps, render_clip, simulate_clip, simulate_rollout
 
-__all__ = ["Recording", "SimulationConfig", "object_maps", "record", "render_clip", "simulate_clip", "simulate_dataset"]
+__all__ = [
+    "Rollout",
+    "SimulationConfig",
+    "object_maps",
+    "render_clip",
+    "simulate_clip",
+    "simulate_dataset",
+    "simulate_rollout",
+]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tapip3d_lite.geometry import look_at
-from tapip3d_lite.simulate.config import SimulationConfig
+from tapip3d_lite.simulate.settings import SimulationConfig
 
 
 @dataclass(frozen=True)

@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
-from tapip3d_lite.files import atomic_path
-from tapip3d_lite.simulate.config import SimulationConfig
+from tapip3d_lite.files import write_text
+from tapip3d_lite.simulate.settings import SimulationConfig
 from tapip3d_lite.simulate.simulator import simulate_clip
 
 DESCRIPTION = "dataset.json"
-Recipe = Callable[[int], SimulationConfig]  # a seed's configuration; a function of a module, since workers import it
+Recipe = Callable[[int], SimulationConfig]  # the configuration for a seed; at a module's top level: workers import it
 
 
 def simulate_dataset(
@@ -36,7 +38,7 @@ def simulate_dataset(
     Args:
         out: the folder; made if missing. Only one run may write to it at a time.
         count: number of clips.
-        config: what they contain, or a function that tells it for each seed; default values if None.
+        config: what they contain, or a function that returns it for each seed; default values if None.
         first_seed: non-negative.
         workers: processes; None for one per core.
         progress: show a bar.
@@ -54,22 +56,35 @@ def simulate_dataset(
     _claim(folder, config)
     jobs = [(folder / f"clip_{seed:06d}.npz", seed, config) for seed in range(first_seed, first_seed + count)]
     missing = [job for job in jobs if not job[0].exists()]
-    workers = min(workers or os.cpu_count() or 1, len(missing))
-    bar = tqdm(total=count, initial=count - len(missing), unit="clip", disable=not progress)
-    with bar:
-        if workers > 1:
-            with multiprocessing.get_context("spawn").Pool(workers) as pool:
-                for _ in pool.imap_unordered(_write, missing):
-                    bar.update()
-        else:
-            for job in missing:
-                _write(job)
-                bar.update()
+    with tqdm(total=count, initial=count - len(missing), unit="clip", disable=not progress) as bar:
+        for _ in run_jobs(_write, missing, workers):
+            bar.update()
     return [job[0] for job in jobs]
 
 
+def run_jobs(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int | None = None) -> Iterator[Any]:
+    """Yield a function's result for each job as it is done: in this process, or by several workers in any order.
+
+    Args:
+        function: at the top level of a module, since workers import it.
+        jobs: its arguments, one for each call.
+        workers: processes at most; None for one per core.
+    """
+    workers = min(workers or os.cpu_count() or 1, len(jobs))
+    if workers > 1:
+        with multiprocessing.get_context("spawn").Pool(workers, leave_interrupts) as pool:
+            yield from pool.imap_unordered(function, jobs)
+    else:
+        yield from map(function, jobs)
+
+
+def leave_interrupts(worker: int = 0) -> None:
+    """Make a worker process ignore Ctrl-C, which its parent receives too; the parent then ends its workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def _claim(folder: Path, config: SimulationConfig | Recipe) -> None:
-    """Make the folder ours: describe it, or check that its description is the same; drop half-written files."""
+    """Write the folder's description, or check that it is the same; delete half-written files."""
     path, description = folder / DESCRIPTION, _describe(config)
     if path.exists():
         wanted = json.loads(json.dumps(description.get("simulation", description)))
@@ -85,14 +100,13 @@ def _claim(folder: Path, config: SimulationConfig | Recipe) -> None:
     elif any(folder.glob("clip_*.npz")):
         raise ValueError(f"simulate_dataset: {folder} holds clips but no {DESCRIPTION}; choose another folder")
     else:
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(description, indent=2) + "\n")
+        write_text(path, json.dumps(description, indent=2) + "\n")
     for leftover in folder.glob(".clip_*.npz"):
         leftover.unlink()
 
 
 def _describe(config: SimulationConfig | Recipe) -> dict:
-    """What tells this configuration from others; of a recipe its name and its values for a few seeds."""
+    """What distinguishes this configuration from others; of a recipe its name and its values for a few seeds."""
     if isinstance(config, SimulationConfig):
         return {"simulation": asdict(config)}
     examples = {str(seed): asdict(config(seed)) for seed in range(4)}
@@ -100,7 +114,7 @@ def _describe(config: SimulationConfig | Recipe) -> dict:
 
 
 def _read(path: Path) -> dict:
-    """The stored description, flat enough to name what differs."""
+    """The stored description as one flat dictionary."""
     try:
         stored = json.loads(path.read_text())
         return dict(stored.get("simulation", stored))

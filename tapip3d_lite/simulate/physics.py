@@ -1,11 +1,11 @@
-"""Rigid-body physics: from a scene to the state of every body at every instant that is rendered."""
+"""Rigid-body physics: the state of every body of a scene at every rendered instant."""
 
 from __future__ import annotations
 
 import mujoco
 import numpy as np
 
-from tapip3d_lite.simulate.scene import Scene
+from tapip3d_lite.simulate.bodies import SimulatedScene
 
 STEP = 1 / 240  # seconds, at most
 SETTLING = 1.0  # seconds that resting bodies get to come to rest before the first frame
@@ -16,8 +16,8 @@ class UnstableSceneError(Exception):
     """This draw of a scene cannot be used; draw another."""
 
 
-def roll_out(scene: Scene, frames: int, fps: float, offsets: np.ndarray) -> np.ndarray:
-    """Let the bodies fly and return the generalised positions at each frame and sub-frame.
+def roll_out(scene: SimulatedScene, frames: int, fps: float, offsets: np.ndarray) -> np.ndarray:
+    """Simulate the bodies and return their generalised positions at each frame and sub-frame.
 
     Args:
         frames: T.
@@ -46,7 +46,7 @@ def roll_out(scene: Scene, frames: int, fps: float, offsets: np.ndarray) -> np.n
     return history[instants]
 
 
-def _settle(scene: Scene, data: mujoco.MjData) -> None:
+def _settle(scene: SimulatedScene, data: mujoco.MjData) -> None:
     """Bring resting bodies to rest while the others wait far above, then put those at their start."""
     waiting = [i for i, body in enumerate(scene.bodies) if body.moving]
     start = data.qpos.copy()
@@ -61,12 +61,12 @@ def _settle(scene: Scene, data: mujoco.MjData) -> None:
         data.qvel[_slot(scene, index, 6)] = [*body.velocity, *body.spin]
 
 
-def _slot(scene: Scene, index: int, width: int) -> slice:
+def _slot(scene: SimulatedScene, index: int, width: int) -> slice:
     free = index - sum(body.fixed for body in scene.bodies[:index])
     return slice(free * width, (free + 1) * width)
 
 
-def geom_poses(scene: Scene, states: np.ndarray) -> np.ndarray:
+def geom_poses(scene: SimulatedScene, states: np.ndarray) -> np.ndarray:
     """World poses (T, G, 4, 4) of all geoms at states (T, nq)."""
     data = mujoco.MjData(scene.model)
     poses = np.tile(np.eye(4), (len(states), scene.model.ngeom, 1, 1))

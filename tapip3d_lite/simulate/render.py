@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from tapip3d_lite.simulate.scene import HIDDEN_GROUP, Scene
+from tapip3d_lite.simulate.bodies import HIDDEN_GROUP, SimulatedScene
 
 SUN_DISTANCE = 30.0
 SUN_RADIUS = 0.8  # metres at that distance: penumbras about as wide as on a lightly clouded day
@@ -57,7 +57,7 @@ def camera_center(extrinsics: np.ndarray) -> np.ndarray:
 
 
 def render_depth(
-    scene: Scene, data: mujoco.MjData, rays: np.ndarray, extrinsics: np.ndarray
+    scene: SimulatedScene, data: mujoco.MjData, rays: np.ndarray, extrinsics: np.ndarray
 ) -> tuple[np.ndarray, Hits]:
     """z-depths (R,) along camera-frame rays (R, 3), 0 where the sky is, and the hits."""
     hits = cast(scene.model, data, camera_center(extrinsics), rays @ extrinsics[:3, :3])
@@ -65,7 +65,7 @@ def render_depth(
 
 
 def render_color(
-    scene: Scene,
+    scene: SimulatedScene,
     data: mujoco.MjData,
     rays: np.ndarray,
     extrinsics: np.ndarray,
@@ -101,7 +101,7 @@ def to_bytes(linear: np.ndarray) -> np.ndarray:
 
 
 def _shade(
-    scene: Scene,
+    scene: SimulatedScene,
     data: mujoco.MjData,
     points: np.ndarray,
     normal: np.ndarray,
@@ -140,9 +140,14 @@ def _shade(
 
 
 def _sunlit(
-    scene: Scene, data: mujoco.MjData, points: np.ndarray, geom: np.ndarray, asked: np.ndarray, shape: tuple[int, int]
+    scene: SimulatedScene,
+    data: mujoco.MjData,
+    points: np.ndarray,
+    geom: np.ndarray,
+    asked: np.ndarray,
+    shape: tuple[int, int],
 ) -> np.ndarray:
-    """The visible share of the sun (R,) float32 at points on a grid of `shape`; 1 without a look where not `asked`."""
+    """The visible share of the sun (R,) float32 at points on a grid of `shape`; only where `asked`, else 1."""
     rows, columns = np.indices(shape).reshape(2, -1)
     # Numbered along the diagonals, so that each 2x2 block of the checkerboard's fields looks at all four points.
     index = (rows + columns) // 2 % 2 * 2 + (rows - columns) // 2 % 2
@@ -159,7 +164,7 @@ def _sunlit(
     return _mean_same_geom(lit.reshape(shape), geom.reshape(shape), fields.reshape(shape)).ravel()
 
 
-def _may_hit(scene: Scene, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+def _may_hit(scene: SimulatedScene, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Which rays (R,) bool pass through any body's bounding sphere; most do not, and need no casting."""
     center = data.geom_xpos[scene.first_body :] - origin
     distance = np.linalg.norm(center, axis=-1)

@@ -1,4 +1,4 @@
-"""Which seeds are for what, so that no clip that scores a tracker is ever drawn to train one."""
+"""The seeds of each purpose, kept apart so that no clip of an evaluation is ever used for training."""
 
 from __future__ import annotations
 

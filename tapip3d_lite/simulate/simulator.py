@@ -1,4 +1,4 @@
-"""`simulate_clip`: one seed and a configuration in, one clip with exact truth out."""
+"""`simulate_clip`: a clip with exact ground truth from a seed and a configuration."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.simulate.bodies import SimulatedScene, random_scene
 from tapip3d_lite.simulate.cameras import random_path
-from tapip3d_lite.simulate.config import SimulationConfig
 from tapip3d_lite.simulate.physics import UnstableSceneError, geom_poses, roll_out
-from tapip3d_lite.simulate.recording import Recording
 from tapip3d_lite.simulate.render import Hits, pixel_rays, render_color, render_depth, to_bytes
-from tapip3d_lite.simulate.scene import Scene, random_scene
+from tapip3d_lite.simulate.rollout import Rollout
+from tapip3d_lite.simulate.settings import SimulationConfig
 from tapip3d_lite.simulate.tracks import make_tracks, moving_geoms, sample_pixels
 
 ATTEMPTS = 30
@@ -44,42 +44,42 @@ def simulate_clip(seed: int = 0, config: SimulationConfig | None = None, **overr
         >>> clip.depths.shape
         (2, 32, 32)
     """
-    return _film_all(*_record(seed, make_config(config, **overrides)))
+    return _film_all(*_simulate(seed, make_config(config, **overrides)))
 
 
-def record(seed: int = 0, config: SimulationConfig | None = None, **overrides: object) -> Recording:
-    """The roll-out of `simulate_clip` with the same arguments, which `render_clip` turns into the same clip."""
-    return _record(seed, make_config(config, **overrides))[0]
+def simulate_rollout(seed: int = 0, config: SimulationConfig | None = None, **overrides: object) -> Rollout:
+    """The rollout of `simulate_clip` with the same arguments; `render_clip` makes the same clip of it."""
+    return _simulate(seed, make_config(config, **overrides))[0]
 
 
-def render_clip(recording: Recording) -> Clip:
-    """Film a recording; no physics is computed, so that every machine gets the same clip.
+def render_clip(rollout: Rollout) -> Clip:
+    """Render a rollout without computing physics, so that every machine gets the same clip.
 
     Raises:
-        ValueError: the scene that the seed makes here has other bodies than the recording's.
+        ValueError: the scene that the seed makes here has other bodies than the rollout's.
     """
-    return _film_all(recording, _shoot(_remake(recording), recording))
+    return _film_all(rollout, _shoot(_remake(rollout), rollout))
 
 
-def object_maps(recording: Recording) -> np.ndarray:
+def object_maps(rollout: Rollout) -> np.ndarray:
     """What every pixel's centre sees: (T, H, W) int32, -1 the sky, 0 the room (floor and backdrop), then the bodies."""
-    scene = _remake(recording)
-    geom = np.stack([hits.geom.reshape(recording.config.size) for hits in _shoot(scene, recording).hits])
+    scene = _remake(rollout)
+    geom = np.stack([hits.geom.reshape(rollout.config.size) for hits in _shoot(scene, rollout).hits])
     return np.where(geom < 0, -1, np.maximum(geom - scene.first_body + 1, 0)).astype(np.int32)
 
 
-def _remake(recording: Recording) -> Scene:
-    rng = np.random.default_rng([recording.attempt, recording.seed])
-    scene = random_scene(rng, recording.config, random_path(rng, recording.config).azimuth.mean())
-    if recording.states.shape[2] != scene.model.nq:
+def _remake(rollout: Rollout) -> SimulatedScene:
+    rng = np.random.default_rng([rollout.attempt, rollout.seed])
+    scene = random_scene(rng, rollout.config, random_path(rng, rollout.config).azimuth.mean())
+    if rollout.states.shape[2] != scene.model.nq:
         raise ValueError(
-            f"render_clip: seed {recording.seed} makes a scene with {scene.model.nq} positions here, the recording has "
-            f"{recording.states.shape[2]}; it was made by another version of the simulator"
+            f"render_clip: seed {rollout.seed} makes a scene with {scene.model.nq} positions here, the rollout has "
+            f"{rollout.states.shape[2]}; it was made by another version of the simulator"
         )
     return scene
 
 
-def _record(seed: int, config: SimulationConfig) -> tuple[Recording, Shots]:
+def _simulate(seed: int, config: SimulationConfig) -> tuple[Rollout, Shots]:
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"simulate_clip: seed must be a whole number of at least 0, got {seed!r}")
     failure = None
@@ -107,13 +107,13 @@ def make_config(config: SimulationConfig | None = None, **overrides: object) -> 
 class Shots:
     """What rays through the pixel centres met: poses (T, G, 4, 4), depths (T, H, W) float64, T hits."""
 
-    scene: Scene
+    scene: SimulatedScene
     poses: np.ndarray
     depths: np.ndarray
     hits: list[Hits]
 
 
-def _attempt(seed: int, attempt: int, config: SimulationConfig) -> tuple[Recording, Shots]:
+def _attempt(seed: int, attempt: int, config: SimulationConfig) -> tuple[Rollout, Shots]:
     rng = np.random.default_rng([attempt, seed])
     path = random_path(rng, config)
     scene = random_scene(rng, config, path.azimuth.mean())
@@ -122,25 +122,25 @@ def _attempt(seed: int, attempt: int, config: SimulationConfig) -> tuple[Recordi
     # Stored float32 poses are the truth: everything is rendered with exactly these.
     extrinsics = path.extrinsics(np.arange(config.frames)[:, None] + offsets).astype(np.float32)
     intrinsics = path.intrinsics.astype(np.float32)
-    recording = Recording(seed, attempt, config, states, intrinsics, extrinsics, np.zeros((0, 3), np.int16))
-    shots = _shoot(scene, recording)
+    rollout = Rollout(seed, attempt, config, states, intrinsics, extrinsics, np.zeros((0, 3), np.int16))
+    shots = _shoot(scene, rollout)
     moving = moving_geoms(scene, shots.poses)
     geom = np.stack([h.geom.reshape(config.size) for h in shots.hits])
     _check_view(scene, geom, shots.depths, moving)
     pixels = sample_pixels(rng, geom, moving, config.tracks, config.share_dynamic)
-    return replace(recording, pixels=pixels.astype(np.int16)), shots
+    return replace(rollout, pixels=pixels.astype(np.int16)), shots
 
 
-def _shoot(scene: Scene, recording: Recording) -> Shots:
-    center = recording.states.shape[1] // 2
-    states, extrinsics = recording.states[:, center], recording.extrinsics[:, center].astype(float)
-    depths, hits = _measure(scene, recording.config, states, recording.intrinsics.astype(float), extrinsics)
+def _shoot(scene: SimulatedScene, rollout: Rollout) -> Shots:
+    center = rollout.states.shape[1] // 2
+    states, extrinsics = rollout.states[:, center], rollout.extrinsics[:, center].astype(float)
+    depths, hits = _measure(scene, rollout.config, states, rollout.intrinsics.astype(float), extrinsics)
     return Shots(scene, geom_poses(scene, states), depths, hits)
 
 
-def _film_all(recording: Recording, shots: Shots) -> Clip:
-    config, scene, states = recording.config, shots.scene, recording.states
-    intrinsics, extrinsics = recording.intrinsics.astype(float), recording.extrinsics.astype(float)
+def _film_all(rollout: Rollout, shots: Shots) -> Clip:
+    config, scene, states = rollout.config, shots.scene, rollout.states
+    intrinsics, extrinsics = rollout.intrinsics.astype(float), rollout.extrinsics.astype(float)
     center = states.shape[1] // 2
     extras = {}
     if config.stereo_baseline:
@@ -148,7 +148,7 @@ def _film_all(recording: Recording, shots: Shots) -> Clip:
         right[..., 0, 3] -= config.stereo_baseline
         extras["video_right"] = _film(scene, config, states, intrinsics, right)
         extras["stereo_baseline"] = np.float32(config.stereo_baseline)
-    cameras, pixels = (intrinsics, extrinsics[:, center]), recording.pixels.astype(int)
+    cameras, pixels = (intrinsics, extrinsics[:, center]), rollout.pixels.astype(int)
     tracks = make_tracks(scene, states[:, center], shots.poses, shots.hits, shots.depths, *cameras, pixels)
     return Clip(
         video=_film(scene, config, states, intrinsics, extrinsics),
@@ -156,14 +156,14 @@ def _film_all(recording: Recording, shots: Shots) -> Clip:
         intrinsics=np.repeat(intrinsics[None], config.frames, 0),
         extrinsics=extrinsics[:, center],
         tracks=tracks,
-        name=f"simulated_{recording.seed}",
+        name=f"simulated_{rollout.seed}",
         fps=config.fps,
         extras=extras,
     )
 
 
 def _measure(
-    scene: Scene, config: SimulationConfig, states: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray
+    scene: SimulatedScene, config: SimulationConfig, states: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray
 ) -> tuple[np.ndarray, list[Hits]]:
     """z-depths (T, H, W) float64 and the pixel centres' hits of all frames."""
     data = mujoco.MjData(scene.model)
@@ -179,7 +179,7 @@ def _measure(
 
 
 def _film(
-    scene: Scene, config: SimulationConfig, states: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray
+    scene: SimulatedScene, config: SimulationConfig, states: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray
 ) -> np.ndarray:
     """The video (T, H, W, 3) uint8; states (T, S, nq) and extrinsics (T, S, 4, 4) are averaged over S in light."""
     data = mujoco.MjData(scene.model)
@@ -195,7 +195,7 @@ def _film(
     return video
 
 
-def _check_view(scene: Scene, geom: np.ndarray, depths: np.ndarray, moving: np.ndarray) -> None:
+def _check_view(scene: SimulatedScene, geom: np.ndarray, depths: np.ndarray, moving: np.ndarray) -> None:
     """Refuse clips in which there is nothing to track or the camera stands inside a body."""
     bodies = geom >= scene.first_body
     seen = (moving[geom] & bodies).mean((1, 2)) > MIN_SEEN

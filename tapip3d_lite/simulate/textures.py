@@ -1,8 +1,8 @@
 """Solid textures: colour as a smooth function of the position in a body, so that it sticks to the body.
 
 Every texture is a pattern with features of 0.1 to 0.4 units and soft edges (so that small pictures do not alias),
-varied by a slow tint over the whole body and by faint grain. The slow part tells repeated cells apart, which makes
-points of a regular pattern matchable. Colours are linear reflectances in [0, 1].
+varied by a slow tint over the whole body and by faint grain. The tint makes repeated cells differ, so that points of a
+regular pattern can be matched. Colours are linear reflectances in [0, 1].
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Texture:
         pattern: maps pattern coordinates (P, 3) to colours (P, 3).
         frame: (3, 3) body to pattern coordinates, x' = x @ frame + offset.
         offset: (3,).
-        slow: waves of the tint over the body, and `fine` those of the grain.
+        slow, fine: fields of the tint over the body and of the grain.
         accent: (3,) colour that the tint leans to.
     """
 
@@ -68,7 +68,7 @@ def random_texture(
     """Draw a texture.
 
     Args:
-        rng: source of all random choices.
+        rng: random generator of everything that is drawn.
         kind: one of `KINDS`, or None for any.
         scale: size of the features relative to those of bodies; floors and backdrops want 2 to 6.
         flat: for a surface in the plane z = 0: turn the pattern about z only and cut its cells through the middle.
@@ -143,8 +143,3 @@ def random_sky(rng: np.random.Generator) -> Sky:
     ][rng.integers(4)]
     ground = np.float32(rng.uniform(0.18, 0.4)) * rng.uniform(0.8, 1.1, 3)
     return Sky(*(np.array(c, np.float32) for c in (zenith, horizon, ground)), waves(rng, 9, 1.3), rng.uniform(-1, 0.3))
-
-
-def sky(directions: np.ndarray, rng: np.random.Generator | Sky) -> np.ndarray:
-    """Colours (P, 3) of unit directions (P, 3) under a `Sky`, or under a new random one."""
-    return (rng if isinstance(rng, Sky) else random_sky(rng)).color(directions)

@@ -7,14 +7,14 @@ import numpy as np
 
 from tapip3d_lite.clip import Tracks
 from tapip3d_lite.geometry import invert, project, transform, unproject
+from tapip3d_lite.simulate.bodies import SimulatedScene
 from tapip3d_lite.simulate.render import Hits, camera_center, cast
-from tapip3d_lite.simulate.scene import Scene
 
 MOTION = 0.05  # metres that a body's surface must leave its first place by to count as moving
 SLACK = 1e-4  # of the distance: a hit this little in front of the point is the point itself
 
 
-def moving_geoms(scene: Scene, poses: np.ndarray) -> np.ndarray:
+def moving_geoms(scene: SimulatedScene, poses: np.ndarray) -> np.ndarray:
     """Which geoms (G,) really move in the world, given all frames' poses (T, G, 4, 4)."""
     reach = scene.model.geom_rbound  # 0 for planes, which stay where they are
     ends = np.concatenate([np.eye(3), -np.eye(3)])[None] * reach[:, None, None]
@@ -58,7 +58,7 @@ def _sample_mask(rng: np.random.Generator, mask: np.ndarray, count: int) -> np.n
 
 
 def make_tracks(
-    scene: Scene,
+    scene: SimulatedScene,
     states: np.ndarray,
     poses: np.ndarray,
     hits: list[Hits],
@@ -94,7 +94,7 @@ def make_tracks(
 
 
 def point_visibility(
-    scene: Scene,
+    scene: SimulatedScene,
     states: np.ndarray,
     xyz: np.ndarray,
     normals: np.ndarray,

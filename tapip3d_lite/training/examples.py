@@ -14,7 +14,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.processes import leave_interrupts
+from tapip3d_lite.simulate.dataset import leave_interrupts
 from tapip3d_lite.training.augment import augment
 from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.data import Batch, FeatureCache, make_batch

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.evaluation.evaluate import RASTER, evaluate, mean_scores
-from tapip3d_lite.geometry import transform
+from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
+from tapip3d_lite.geometry import RASTER, transform
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.windows import Step
 from tapip3d_lite.training.data import Batch

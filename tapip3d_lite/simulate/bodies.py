@@ -1,4 +1,4 @@
-"""A random scene: which bodies there are, where they start, how fast they fly, and what everything is painted with."""
+"""A random scene: its bodies with their starting positions and velocities, textures and light, as a MuJoCo model."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from tapip3d_lite.simulate.config import PRIMITIVES, SimulationConfig
 from tapip3d_lite.simulate.meshes import MESHES
+from tapip3d_lite.simulate.settings import PRIMITIVES, SimulationConfig
 from tapip3d_lite.simulate.textures import Sky, Texture, random_sky, random_texture
 
 DOME_RADIUS = 11.0
@@ -31,8 +31,8 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A compiled MuJoCo model with what it lacks: starting velocities, textures and light.
+class SimulatedScene:
+    """A compiled MuJoCo model with what MuJoCo does not know: starting velocities, textures and light.
 
     Attributes:
         model: geoms in the order floor, (backdrop,) bodies.
@@ -63,7 +63,7 @@ class Scene:
         return (self.first_body == 2) & (geom == 1)
 
 
-def random_scene(rng: np.random.Generator, config: SimulationConfig, azimuth: float) -> Scene:
+def random_scene(rng: np.random.Generator, config: SimulationConfig, azimuth: float) -> SimulatedScene:
     """Draw a scene; `azimuth` (radians) is the camera's mean direction, where an occluder has to stand."""
     floor, behind = random_texture(rng, scale=2.0, flat=True), random_texture(rng, scale=5.0)
     shared = random_texture(rng) if config.same_texture else None
@@ -76,7 +76,7 @@ def random_scene(rng: np.random.Generator, config: SimulationConfig, azimuth: fl
     height, around = rng.uniform(0.75, 1.2), rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(around) * np.cos(height), np.sin(around) * np.cos(height), np.sin(height)])
     warmth = rng.uniform(0, 0.12)
-    return Scene(
+    return SimulatedScene(
         model=_compile(rng, config, bodies),
         bodies=tuple(bodies),
         textures=(*environment, *(body.texture for body in bodies)),

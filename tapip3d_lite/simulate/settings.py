@@ -1,4 +1,4 @@
-"""`SimulationConfig`: everything that shapes a simulated clip, apart from its seed."""
+"""`SimulationConfig`: all settings of a simulated clip, apart from its seed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class SimulationConfig:
         share_dynamic: share of the queries that fall on bodies which move in the world.
 
     Raises:
-        ValueError: names the argument, what was expected, what came, and what to do.
+        ValueError: names the argument, the expected and the received value, and what to do.
     """
 
     frames: int = 24
