@@ -111,38 +111,24 @@ class Stream:
         self.rows = torch.from_numpy(rows).to(next(self.tracker.parameters()).device)[None]
         nothing = self.rows.new_zeros(1, 0, len(rows), 3)
         self.state = State(nothing, nothing[..., 0], nothing.new_zeros(1, len(rows), 3), self.rows[..., 0].long())
-        self.xyz = np.zeros((0, len(rows), 3), np.float32)
 
     def _push(self, frames: Frames, features: Tensor) -> Tracks | None:
-        state, size, now = self.state, self.tracker.config.window, self.seen
+        state, size = self.state, self.tracker.config.window
         flat = getattr(self.space, "free_axes", (1.0, 1.0, 1.0))[2] == 0
         depth = frames.depths if flat else frames.depths[..., :1, :1].clone()  # only flat spaces need it once lifted
         self.cameras.append((frames.intrinsics, frames.extrinsics, depth))
-        arriving = state.times[0] == now
+        arriving = state.times[0] == self.seen
         if bool(arriving.any()):
             mine = self.rows[:, None, arriving, 1:]
             state.queries[:, arriving] = self.space.from_world(mine, frames.intrinsics, frames.extrinsics)[:, 0]
             state.coords[:, :, arriving] = state.queries[:, None, arriving]
-        state.coords = torch.cat([state.coords, state.queries[:, None]], 1)
+        state.coords = torch.cat([state.coords, state.queries[:, None]], 1)  # (1, T, N, 3)
         state.logits = torch.cat([state.logits, state.coords.new_zeros(1, 1, self.rows.shape[1])], 1)
-        future = (state.times[0] > now).cpu().numpy()
-        still = self._still(slice(now, now + 1), slice(None))
-        still[:, future] = self.rows[0, future, 1:].cpu().numpy()  # known to the world, but not yet to a camera
-        self.xyz = np.concatenate([self.xyz, still])
-        if bool(arriving.any()):
-            self.xyz[:, arriving.cpu().numpy()] = self._still(slice(0, now + 1), arriving)
         self.window = [*self.window[-(size - 1) :], (frames, features)]
         self.seen += 1
         if self.seen < size or (self.seen - size) % (size // 2):
             return None
         return self._solve(self.seen - size, self.seen)
-
-    def _still(self, frames: slice, tracks: Any) -> np.ndarray:
-        """Tracks that have not been solved yet: they stay at their query, seen by each frame's camera."""
-        cameras = (torch.cat(parts, 1) for parts in zip(*self.cameras[frames], strict=True))
-        coords = self.state.queries[:, None, tracks].expand(-1, len(self.cameras[frames]), -1, -1)
-        with torch.autocast(coords.device.type, enabled=False):
-            return self.space.to_world(coords, *cameras)[0].cpu().numpy()
 
     def _solve(self, start: int, stop: int) -> Tracks:
         if bool((self.state.times < stop).any()):
@@ -153,7 +139,6 @@ class Stream:
             for step in self.tracker.solve(scene, self.support, self.state, self.iterations):
                 if self.watch is not None:
                     self.watch(step)
-            self.xyz[start:stop, step.columns.cpu().numpy()] = step.xyz[0].cpu().numpy()
         return self._tracks(start, stop)
 
     def _add_support(self, scene: Scene, start: int, stop: int) -> None:
@@ -174,10 +159,16 @@ class Stream:
                     getattr(whole, name)[:, new] = getattr(near, name)
 
     def _tracks(self, start: int, stop: int) -> Tracks:
-        count = len(self.queries)  # without the support grid
-        logits = self.state.logits[0, start:stop, :count].cpu().numpy()
+        count, state = len(self.queries), self.state  # without the support grid
+        logits = state.logits[0, start:stop, :count].cpu().numpy()
         visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= self.threshold
-        return Tracks(self.xyz[start:stop, :count].copy(), visible, self.queries, logits)
+        xyz = np.zeros((stop - start, count, 3), np.float32)
+        if stop > start:
+            cameras = (torch.cat(parts, 1) for parts in zip(*self.cameras[start:stop], strict=True))
+            with torch.autocast(self.rows.device.type, enabled=False):
+                xyz = self.space.to_world(state.coords[:, start:stop, :count], *cameras)[0].cpu().numpy()
+        future = self.queries[:, 0] >= self.seen  # known to the world, but not yet to a camera
+        return Tracks(np.where(future[:, None], self.queries[:, 1:], xyz), visible, self.queries, logits)
 
 
 def _checked(queries: Any) -> np.ndarray:
