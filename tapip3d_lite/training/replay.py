@@ -1,38 +1,46 @@
 """`Replay`: a training step recorded once as a CUDA graph, then replayed for each batch.
 
-A step of a small tracker is tens of thousands of small kernels, and Python takes longer to ask for each than a GPU to
-run it. A graph holds them all and is started by one call. The numbers are those of the step itself.
+A step of a small tracker is tens of thousands of small kernels, and launching them one by one from Python takes longer
+than computing them. A graph is launched by one call. The numbers are those of the step itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.training.data import Batch
+_WARM = 2  # runs before recording, which compile and choose algorithms
 
-_WARM = 2  # runs before recording: they compile, and choose algorithms
+
+class Inputs(Protocol):
+    """What a step computes with: tensors, and frames whose number is their length."""
+
+    frames: Any
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Inputs:
+        """The same with every tensor replaced by `change` of it, always in the same order."""
 
 
 class Replay:
-    """A step that adds gradients, recorded for each number of frames and updates that it meets.
+    """A step that sets gradients, recorded for each number of frames and of updates that occurs.
 
-    Each recording keeps a step's memory for itself, so a recipe of many lengths needs as many times as much.
+    Each recording keeps the memory of a step, so a recipe with many lengths needs many times as much.
     """
 
-    def __init__(self, run: Callable[[Batch, int], tuple[Tensor, ...]], parameters: Sequence[nn.Parameter]) -> None:
+    def __init__(self, run: Callable[[Any, int], tuple[Tensor, ...]], parameters: Sequence[nn.Parameter]) -> None:
         """Prepare to record.
 
         Args:
-            run: from a batch and M to tensors; leaves gradients. It must ask for no number (`Tracker.steady`).
+            run: takes a batch and M, returns tensors, and adds gradients. It must not read numbers from the GPU.
             parameters: that get gradients.
         """
         self._run, self._parameters, self._recorded = run, list(parameters), {}
 
-    def __call__(self, batch: Batch, iterations: int) -> tuple[Tensor, ...]:
-        """What `run` returns, overwritten by the next call; gradients are set, not added."""
+    def __call__(self, batch: Inputs, iterations: int) -> tuple[Tensor, ...]:
+        """The results of `run`, which the next call overwrites; gradients are set, not added."""
         key = len(batch.frames), iterations
         if key not in self._recorded:
             self._recorded[key] = self._record(batch, iterations)
@@ -44,7 +52,7 @@ class Replay:
             parameter.grad = gradient
         return results
 
-    def _record(self, batch: Batch, iterations: int) -> tuple:
+    def _record(self, batch: Inputs, iterations: int) -> tuple:
         inputs, side, graph = batch.map(torch.clone), torch.cuda.Stream(), torch.cuda.CUDAGraph()
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side):
@@ -52,7 +60,7 @@ class Replay:
                 self._forget()
                 self._run(inputs, iterations)
         torch.cuda.current_stream().wait_stream(side)
-        self._forget()  # gradients made while recording belong to the graph
+        self._forget()  # gradients allocated while recording belong to the graph
         with torch.cuda.graph(graph):
             results = self._run(inputs, iterations)
         gradients = [parameter.grad for parameter in self._parameters]
@@ -63,7 +71,7 @@ class Replay:
             parameter.grad = None
 
 
-def _tensors(batch: Batch) -> list[Tensor]:
+def _tensors(batch: Inputs) -> list[Tensor]:
     tensors: list[Tensor] = []
     batch.map(lambda x: tensors.append(x) or x)
     return tensors
