@@ -17,7 +17,7 @@ from tyro.conf import Positional, arg
 
 import tapip3d_lite as t3d
 from tapip3d_lite import commands
-from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.recipe import TrainConfig
 
 
 def track(

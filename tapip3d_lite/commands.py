@@ -37,7 +37,7 @@ def curves(
     by: Annotated[str, arg(help="step or minutes")] = "step",
 ) -> None:
     """Draw the learning curves of trainings, finished or not: matching, loss, accuracy, held-out scores."""
-    from tapip3d_lite.training.journal import read_log
+    from tapip3d_lite.training.run_folder import read_log
     from lessons.n06_live import learning_curves
 
     logs = [(folder.stem if folder.is_file() else folder.resolve().name, read_log(folder)) for folder in folders]
