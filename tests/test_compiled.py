@@ -1,4 +1,4 @@
-"""A training whose parts torch compiles takes the same steps; the backend is one that runs anywhere, and soon."""
+"""A training whose parts torch compiles takes the same steps; the backend here is fast and needs no compiler."""
 
 from collections import Counter
 from functools import cache
@@ -12,13 +12,11 @@ from torch._dynamo.utils import counters
 from torch._functorch import config as functorch
 
 import tapip3d_lite as t3d
+from tapip3d_lite.lab import make_trainer
 from tapip3d_lite.model.fourier import DEGREES
 from tapip3d_lite.model.support import _at_once
-from tapip3d_lite.training.sampling import SamplingConfig
-from tapip3d_lite.training.trainer import Trainer
-from tests.test_trainer import SIZES, clips, recipe
-
-__all__ = ["clips"]
+from tapip3d_lite.training.data import SamplingConfig
+from tests.tiny import SIZES, recipe
 
 
 @pytest.fixture
@@ -58,7 +56,7 @@ def test_compiled_parts_take_the_same_steps(tmp_path, clips, graphs, monkeypatch
     logs = []
     for compiled in (False, True):
         held_out = [t3d.load_clip(clips[0])]
-        trainer = Trainer(tmp_path / f"{compiled}", config, clips, held_out, compiled=compiled)
+        trainer = make_trainer(tmp_path / f"{compiled}", config, clips, held_out, compiled=compiled)
         trainer.tracker.neighborhood.fast = False  # trees are for a CPU, where nobody compiles
         assert not graphs
         logs.append(list(trainer.steps()))

@@ -17,12 +17,7 @@ from tapip3d_lite.model.neighbors import KNearest, Neighbors, knn
 from tapip3d_lite.model.support import bilinear
 from tapip3d_lite.model.tokens import token_width, trajectory_tokens
 from tapip3d_lite.model.updater import Transformer
-
-SMALL = {
-    "image_size": (32, 48), "window": 4, "feature_dim": 8, "levels": 2, "neighbors": 3, "token_dim": 6,
-    "context_heads": 2, "context_head_dim": 3, "offset_layers": 2, "offset_dim": 7, "hidden": 12, "heads": 2,
-    "head_dim": 5, "time_depth": 2, "space_depth": 1, "virtual_tracks": 3,
-}  # fmt: skip
+from tests.tiny import SMALL
 
 
 @pytest.fixture(params=range(3))

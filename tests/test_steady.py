@@ -1,4 +1,6 @@
-"""A step that asks the device for no number: the same gradients, and nothing that a CUDA graph could not hold."""
+"""A step that reads no number from the device: the same gradients, and nothing that a CUDA graph cannot hold."""
+
+from dataclasses import replace
 
 import pytest
 import torch
@@ -6,12 +8,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tapip3d_lite.model.fourier import DEGREES
 from tapip3d_lite.model.support import _at_once
+from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.replay import Replay
-from tapip3d_lite.training.sampling import SamplingConfig
 from tapip3d_lite.training.trainer import Trainer
-from tests.test_trainer import clips, recipe
-
-__all__ = ["clips"]
+from tests.tiny import recipe
 
 ASKS = ("_local_scalar_dense", "nonzero", "lift_fresh", "unique", "masked_select", "is_nonzero")
 
@@ -47,8 +47,8 @@ def trainer(tmp_path, clips, monkeypatch):
 
 def gradients(trainer, batch):
     trainer.optimizer.zero_grad()
-    told = trainer._track(batch)
-    return told, [p.grad.clone() for p in trainer.parameters if p.grad is not None]
+    line = trainer._track(batch)
+    return line, [p.grad.clone() for p in trainer.parameters if p.grad is not None]
 
 
 def alike(some, others):
@@ -59,10 +59,10 @@ def alike(some, others):
 def test_a_steady_step_has_the_same_gradients(trainer):
     batch = trainer.example()
     assert int(batch.truth.times.max()) >= 4  # so that some tracks join later
-    told, plain = gradients(trainer, batch)
+    line, plain = gradients(trainer, batch)
     trainer._replay = trainer._add_gradients
-    told_steady, steady = gradients(trainer, batch)
-    assert told_steady == pytest.approx(told, rel=1e-5) and not trainer.tracker.steady
+    steady_line, steady = gradients(trainer, batch)
+    assert steady_line == pytest.approx(line, rel=1e-5) and not trainer.tracker.steady
     assert alike(plain, steady)
 
 
@@ -112,15 +112,15 @@ def test_a_recording_is_made_for_each_length_and_gets_each_batch(trainer, monkey
 
         return Graph(), inputs, results, gradients
 
-    batches = [trainer.examples.batch(step) for step in range(3)]
+    batches = [trainer.examples.batch(step, step) for step in range(3)]
     expected = [gradients(trainer, batch) for batch in batches]
     monkeypatch.setattr(Replay, "_record", record)
     trainer._replay = Replay(trainer._add_gradients, trainer.parameters)
-    for batch, (told, plain) in zip(batches, expected, strict=True):
+    for batch, (line, plain) in zip(batches, expected, strict=True):
         again, replayed = gradients(trainer, batch)
-        assert again == pytest.approx(told, rel=1e-5)
+        assert again == pytest.approx(line, rel=1e-5)
         assert alike(plain, replayed)
     assert len(made) == len(set(made)) == 1
-    trainer.step = next(s for s in range(50) if trainer.examples.lengths(s)[1] != made[0][1])
-    gradients(trainer, batches[0])
+    longer = replace(batches[0], iterations=made[0][1] + 1)
+    gradients(trainer, longer)
     assert len(made) == len(set(made)) == 2

@@ -7,7 +7,7 @@ import tapip3d_lite as t3d
 from tapip3d_lite.model.frames import Frames, frames_from_clip
 from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.support import _at_once, query_support
-from tests.test_trainer import SIZES
+from tests.tiny import SIZES
 
 WINDOW = {"neighborhood": "window", "context": "correlation", "neighbors": 9, "space": "uvd"}
 

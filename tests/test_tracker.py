@@ -17,7 +17,7 @@ from tapip3d_lite.model.spaces import World
 from tapip3d_lite.model.tracker import Tracker, TrackerConfig
 from tapip3d_lite.model.windows import State, window_ends
 from tests import parity
-from tests.test_model import SMALL
+from tests.tiny import SMALL
 
 
 @pytest.fixture(scope="module")

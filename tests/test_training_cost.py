@@ -6,9 +6,7 @@ import pytest
 import torch
 
 from tests.bench.training_cost import SavedBytes, backward_memory, memory_table, split_table, step_split
-from tests.test_trainer import SIZES, clips, recipe
-
-__all__ = ["clips"]
+from tests.tiny import SIZES, recipe
 
 
 def test_saved_bytes_by_hand():
@@ -46,7 +44,7 @@ def test_the_first_steps_of_the_recipe_are_measured(clips, monkeypatch):
     from tapip3d_lite.training.examples import Examples
 
     drawn, lengths = [], Examples.lengths
-    monkeypatch.setattr(Examples, "lengths", lambda self, step: drawn.append(lengths(self, step)) or drawn[-1])
+    monkeypatch.setattr(Examples, "lengths", lambda self, *place: drawn.append(lengths(self, *place)) or drawn[-1])
     step_split(recipe(short=0.1, steps=60), clips, steps=5, warm=1)
     assert set(drawn) == {(4, 2)}
 

@@ -78,5 +78,6 @@ class Schedule:
         Args:
             before: position before the last step.
         """
-        done = [(x - self.config.matching_steps) // self.config.evaluate_every for x in (before, self.position)]
+        first, every = self.config.matching_steps, self.config.evaluate_every
+        done = [max(x - first, 0) // every for x in (before, self.position)]
         return done[0] < done[1] or self.finished
