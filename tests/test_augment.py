@@ -49,7 +49,7 @@ def agreement(clip):
 
 
 def plane_clip(frames=3, size=(40, 56), skew=0.0):
-    """A slanted plane whose colours tell where a pixel came from: red is 4u, green is 6v; tracks on the plane."""
+    """A slanted plane whose colours say where a pixel came from: red is 4u, green is 6v; tracks on the plane."""
     height, width = size
     k = np.array([[50.0, skew, 26.3], [0, 47, 18.8], [0, 0, 1]])
     uv = pixel_grid(height, width, like=k)

@@ -50,14 +50,14 @@ def test_compiled_parts_take_the_same_steps(tmp_path, clips, graphs, monkeypatch
     # Compiled, images are resized with other rounding (1e-6), which 2^13 x would make 1e-2 by the second update.
     monkeypatch.setattr("tapip3d_lite.model.fourier._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
     monkeypatch.setattr("tapip3d_lite.model.tracker.query_support", _at_once)  # as on a GPU
-    sampling = SamplingConfig(tracks=6, seen=1.0, anywhere=0.0)  # all are asked for in the first frame
+    sampling = SamplingConfig(tracks=6, seen=1.0, anywhere=0.0)  # all queries are in the first frame
     sizes = {"frames": 6, "sampling": sampling, "tracker": SIZES | {"time_depth": 2, "space_depth": 2}}  # two windows
     config = recipe(train_encoder=True, matching_steps=0, steps=2, evaluate_every=2, **sizes)
     logs = []
     for compiled in (False, True):
         held_out = [t3d.load_clip(clips[0])]
         trainer = make_trainer(tmp_path / f"{compiled}", config, clips, held_out, compiled=compiled)
-        trainer.tracker.neighborhood.fast = False  # trees are for a CPU, where nobody compiles
+        trainer.tracker.neighborhood.fast = False  # trees are for a CPU, which does not compile
         assert not graphs
         logs.append(list(trainer.steps()))
     one, other = ([[line[name] for name in ("loss", "norm")] for line in log] for log in logs)

@@ -62,6 +62,15 @@ def test_other_processes_make_the_same_examples_in_the_same_order(clips):
         assert all(same(a, b) for a, b in zip(alone[first:last], made, strict=True))
 
 
+def test_examples_are_short_at_first_then_of_all_lengths(clips):
+    examples = Examples(recipe(matching_steps=10, steps=100, short=0.3, frames=(4, 8), iterations=(1, 3)), clips)
+    assert {examples.lengths(step, step) for step in range(10, 40)} == {(4, 1)}
+    assert {examples.lengths(step, step) for step in range(40, 110)} == {(t, m) for t in (4, 6, 8) for m in (1, 2, 3)}
+    assert all(examples.lengths(step, 12.5) == (4, 1) for step in range(200, 210))  # by a clock
+    batch = examples.batch(50, 50)
+    assert (len(batch.frames), batch.iterations) == examples.lengths(50, 50)
+
+
 @pytest.mark.parametrize("train_encoder", [True, False])
 def test_workers_change_no_bit_of_a_training(tmp_path, clips, one_thread, train_encoder):
     for workers in (0, 2):

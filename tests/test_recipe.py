@@ -12,6 +12,7 @@ import tapip3d_lite as t3d
 from tapip3d_lite.training import schedule as clock
 from tapip3d_lite.training.accuracy import Accuracy
 from tapip3d_lite.training.data import make_batch
+from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.optimizer import one_cycle
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.pretrain import MatchingConfig
@@ -38,7 +39,7 @@ PAPER = {
         "reframe": 1.0, "pad": 25 / 512, "scale": (0.75, 1.25), "drift": 15 / 512, "flip_x": 0.5, "flip_y": 0.5,
     },
 }  # fmt: skip
-"""The paper's values, as `../shared/FACTS.md` has them; its pixels are fractions of a width of 512."""
+"""The paper's values; its pixels are fractions of a width of 512."""
 
 LITE = {
     "clips": 1000, "steps": 6000, "matching_steps": 2500, "batch": 1, "frames": (8, 16), "iterations": (2, 3),
@@ -154,7 +155,7 @@ def test_one_cycle_is_torchs(steps, warmup):
 
 
 def test_accuracy_is_the_loop(clips):
-    clip = replace(t3d.load_clip(clips[0]).cut(0, 6))  # two windows of 4; one of padding would be a third
+    clip = t3d.load_clip(clips[0]).cut(0, 6)  # two windows of 4
     batch = make_batch([clip]).to("cpu")
     assert len({int(t) for t in clip.queries[:, 0]}) > 1 and 0 < int(batch.dynamic.sum()) < batch.dynamic.numel()
     tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **SIZES))
@@ -183,6 +184,16 @@ def test_accuracy_is_the_loop(clips):
     result = Accuracy.result(accuracy.totals)
     assert result == pytest.approx({"apd": inside[0] / counted[0], "apd_dynamic": inside[1] / counted[1]}, rel=1e-4)
     assert 0.2 < result["apd"] < 0.8 and Accuracy.result(torch.zeros(2, 2)) == {"apd": None, "apd_dynamic": None}
+
+
+def test_the_loss_is_the_recipes(tmp_path, clips, one_thread):
+    lines = {}
+    for name, loss in {"one": LossConfig(), "other": LossConfig(scale=0.05, visibility=1.5)}.items():
+        trainer = Trainer(tmp_path / name, recipe(matching_steps=0, loss=loss), clips)
+        lines[name] = next(trainer.steps())
+    assert lines["other"]["position"] == pytest.approx(10 * lines["one"]["position"], rel=1e-5)
+    assert lines["other"]["visibility"] == pytest.approx(5 * lines["one"]["visibility"], rel=1e-5)
+    assert lines["one"]["loss"] == lines["one"]["position"] + lines["one"]["visibility"]
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ from tapip3d_lite.training.replay import Replay
 from tapip3d_lite.training.trainer import Trainer
 from tests.tiny import recipe
 
-ASKS = ("_local_scalar_dense", "nonzero", "lift_fresh", "unique", "masked_select", "is_nonzero")
+READS = ("_local_scalar_dense", "nonzero", "lift_fresh", "unique", "masked_select", "is_nonzero")
 
 
-class Asked(TorchDispatchMode):
-    """Operations that make a CPU wait for a GPU, or copy constants to it."""
+class Reads(TorchDispatchMode):
+    """Collects operations that make a CPU wait for a GPU, or copy constants to it."""
 
     def __enter__(self):
         self.names = []
@@ -25,7 +25,7 @@ class Asked(TorchDispatchMode):
 
     def __torch_dispatch__(self, function, types, arguments=(), options=None):
         name = str(function)
-        self.names += [name for ask in ASKS if ask in name]
+        self.names += [name for read in READS if read in name]
         if name.startswith("aten.index"):
             tensors = [x for part in arguments if isinstance(part, list | tuple) for x in part]
             self.names += [name for x in tensors if isinstance(x, torch.Tensor) and x.dtype == torch.bool]
@@ -35,9 +35,9 @@ class Asked(TorchDispatchMode):
 @pytest.fixture
 def trainer(tmp_path, clips, monkeypatch):
     monkeypatch.setattr("tapip3d_lite.model.tracker.query_support", _at_once)  # as on a GPU
-    # The order of sums differs with masked tracks, and 2^13 x would make much of the last bit.
+    # The order of sums differs with masked tracks, and 2^13 x would magnify the last bit.
     monkeypatch.setattr("tapip3d_lite.model.fourier._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
-    # Some tracks are asked for so late that they do not belong to the first window.
+    # Some tracks have their query so late that they do not belong to the first window.
     late = {"sampling": SamplingConfig(tracks=6, anywhere=1.0, seen=0.0), "frames": (8, 8), "batch": 2}
     config = recipe(matching_steps=0, train_encoder=True, **late)
     trainer = Trainer(tmp_path, config, clips)
@@ -66,16 +66,16 @@ def test_a_steady_step_has_the_same_gradients(trainer):
     assert alike(plain, steady)
 
 
-def test_a_steady_step_asks_for_nothing(trainer):
+def test_a_steady_step_reads_no_number_from_the_device(trainer):
     batch = trainer.example().to("cpu")
     trainer._add_gradients(batch, 2)  # constants are made
-    with Asked() as asked:
+    with Reads() as reads:
         trainer._add_gradients(batch, 2)
-    assert {"aten._local_scalar_dense.default", "aten.nonzero.default"} <= set(asked.names)  # an ordinary one does
+    assert {"aten._local_scalar_dense.default", "aten.nonzero.default"} <= set(reads.names)  # an ordinary one does
     trainer._replay = trainer._add_gradients
-    with Asked() as asked:
+    with Reads() as reads:
         trainer._add_gradients(batch, 2)
-    assert not asked.names
+    assert not reads.names
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")

@@ -207,7 +207,7 @@ def test_the_papers_recipe_takes_a_tiny_step(tmp_path, clips):
     assert {"encoder", "updater"} <= changed
 
 
-def test_augmentation_changes_what_is_drawn_only_where_it_is_asked_for(tmp_path, clips):
+def test_only_a_recipe_with_augmentation_changes_the_clips(tmp_path, clips):
     options = {"train_encoder": True, "matching_steps": 0}
     plain = Trainer(tmp_path / "plain", recipe(**options), clips)
     changed = Trainer(tmp_path / "changed", recipe(**options, augment=True), clips)

@@ -119,18 +119,6 @@ def test_memory_grows_neither_with_updates_nor_with_windows():
     assert peak(plain_backward, 20, 2) > 2 * short
 
 
-def test_training_on_one_clip_reduces_the_loss():
-    _, tracker, frames, queries, truth = setting()
-    optimizer = torch.optim.AdamW(tracker.parameters(), 2e-3)
-    losses = []
-    for _ in range(25):
-        optimizer.zero_grad()
-        losses.append(saving_backward(tracker, frames, queries, truth, LossConfig())["position"])
-        torch.nn.utils.clip_grad_norm_(tracker.parameters(), 10)
-        optimizer.step()
-    assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:3])
-
-
 @pytest.mark.parametrize("bad", [{"form": "metres"}, {"visibility": -1.0}, {"within": -1.0}, {"discount": 0.0}])
 def test_bad_weights(bad):
     with pytest.raises(ValueError, match="LossConfig"):
