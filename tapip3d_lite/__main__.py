@@ -16,7 +16,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 import tapip3d_lite as t3d
-from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.recipe import TrainConfig
 
 
 def track(
@@ -182,7 +182,7 @@ def curves(
 ) -> None:
     """Draw the learning curves of trainings, finished or not: matching, loss, accuracy, held-out scores."""
     from tapip3d_lite.figures.curves import learning_curves
-    from tapip3d_lite.training.journal import read_log
+    from tapip3d_lite.training.run_folder import read_log
 
     logs = [(folder.stem if folder.is_file() else folder.resolve().name, read_log(folder)) for folder in folders]
     t3d.figures.save_png(learning_curves(logs, by=by), out)

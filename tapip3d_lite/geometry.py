@@ -20,6 +20,9 @@ Array = np.ndarray | torch.Tensor
 RASTER = 256
 THRESHOLDS = (1, 2, 4, 8, 16)
 
+RASTER = 256  # pixels of the shorter side of the image on which the benchmarks measure errors
+THRESHOLDS = (1, 2, 4, 8, 16)  # errors in these pixels below which a point counts as found
+
 
 def transform(points: Array, pose: Array) -> Array:
     """Apply a rigid (or affine) motion to points.

@@ -1,4 +1,4 @@
-"""Augmentations: pixels, cameras and truth must still agree after each, and chance must do what its shares say."""
+"""Augmentations: pixels, cameras and truth must still agree after each, and each must have its share of the clips."""
 
 import json
 from dataclasses import asdict, replace
@@ -9,8 +9,15 @@ import pytest
 
 import tapip3d_lite as t3d
 from tapip3d_lite.geometry import pixel_grid, project, transform
-from tapip3d_lite.training.appearance import blur_colors, blur_depth, erase, jitter_colors
-from tapip3d_lite.training.augment import AugmentConfig, augment, augmentations
+from tapip3d_lite.training.augment import (
+    AugmentConfig,
+    augment,
+    augmentations,
+    blur_colors,
+    blur_depth,
+    erase,
+    jitter_colors,
+)
 from tapip3d_lite.training.reframing import flip_time, flip_x, flip_y, random_view, reframe, requery
 
 NEVER = {"erase": 0, "jitter": 0, "blur": 0, "depth_blur": 0, "reframe": 0, "flip_x": 0, "flip_y": 0}
@@ -42,7 +49,7 @@ def agreement(clip):
 
 
 def plane_clip(frames=3, size=(40, 56), skew=0.0):
-    """A slanted plane whose colours tell where a pixel came from: red is 4u, green is 6v; tracks on the plane."""
+    """A slanted plane whose colours say where a pixel came from: red is 4u, green is 6v; tracks on the plane."""
     height, width = size
     k = np.array([[50.0, skew, 26.3], [0, 47, 18.8], [0, 0, 1]])
     uv = pixel_grid(height, width, like=k)
@@ -305,7 +312,7 @@ def test_all_together_at_the_papers_strength(clip):
 
 
 @pytest.mark.parametrize("name", ["erase", "reframe"])
-def test_without_truth_nobody_knows_what_is_still_seen(clip, name):
+def test_queries_without_tracks_are_dropped_where_visibility_changes(clip, name):
     assert change(replace(clip, tracks=None), name).queries is None
     assert change(replace(clip, tracks=None), name).tracks is None
 

@@ -12,11 +12,11 @@ import tyro
 import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.benchmark import SPLITS, difference_table, estimate, save_results, show
 from tapip3d_lite.lab.card import model_card
-from tapip3d_lite.training.config import TrainConfig
-from tapip3d_lite.training.journal import read_log
 from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.motion import MotionConfig
-from tests.test_trainer import SIZES, recipe
+from tapip3d_lite.training.recipe import TrainConfig
+from tapip3d_lite.training.run_folder import read_log
+from tests.tiny import SIZES, recipe
 
 METRICS = [m + part for m in ("AJ3D_none", "APD3D_none", "AJ3D", "APD3D", "OA") for part in ("", "_dynamic", "_static")]
 
@@ -36,7 +36,7 @@ def results():
 def folder(tmp_path, results):
     config = recipe(lr=2e-3, loss=LossConfig(soften=1.5, within=3))
     (tmp_path / "config.json").write_text(json.dumps(config.to_dict()))
-    lines = [{"step": s, "seconds": 450.0 * s} for s in range(1, 17)]
+    lines = [{"step": s, "stage": "matching" if s <= 4 else "tracking", "seconds": 450.0 * s} for s in range(1, 17)]
     lines[-1] |= {"val_AJ3D_none": 0.4321, "val_APD3D_none": 0.5432, "val_OA": 0.6543}
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **SIZES))
@@ -67,7 +67,7 @@ def test_every_number_comes_from_the_files(folder, results):
         assert difference_table(results, "lite · world", other, ("AJ3D_none", "APD3D_none", *METRICS[1:5:3])) in text
     assert "stopped at" not in text
     with open(folder / "log.jsonl", "a") as log:
-        log.write('{"step": 15, "seconds": 1.0}\n')
+        log.write('{"step": 15, "stage": "tracking", "seconds": 1.0}\n')
     text = model_card(folder, folder / "bench.json", "two cores of a toaster", command="torchrun x")
     assert "torchrun x\n" in text and "stopped at step 15 of 16" in text
     changed = results | {"klt": results["static"]}

@@ -1,4 +1,4 @@
-"""A training whose parts torch compiles takes the same steps; the backend is one that runs anywhere, and soon."""
+"""A training whose parts torch compiles takes the same steps; the backend here is fast and needs no compiler."""
 
 from collections import Counter
 from functools import cache
@@ -13,14 +13,12 @@ from torch._dynamo.utils import counters
 from torch._functorch import config as functorch
 
 import tapip3d_lite as t3d
+from tapip3d_lite.lab import make_trainer
 from tapip3d_lite.model.blocks import DEGREES
 from tapip3d_lite.model.neighbors import KNearest
 from tapip3d_lite.speed.cuda_graph import support_at_once
-from tapip3d_lite.training.sampling import SamplingConfig
-from tapip3d_lite.training.trainer import Trainer
-from tests.test_trainer import SIZES, clips, recipe
-
-__all__ = ["clips"]
+from tapip3d_lite.training.data import SamplingConfig
+from tests.tiny import SIZES, recipe
 
 
 @pytest.fixture
@@ -54,14 +52,14 @@ def test_compiled_parts_take_the_same_steps(tmp_path, clips, graphs, monkeypatch
     # Compiled, images are resized with other rounding (1e-6), which 2^13 x would make 1e-2 by the second update.
     monkeypatch.setattr("tapip3d_lite.model.blocks._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
     monkeypatch.setattr("tapip3d_lite.model.tracker.query_support", support_at_once)  # as on a GPU
-    sampling = SamplingConfig(tracks=6, seen=1.0, anywhere=0.0)  # all are asked for in the first frame
+    sampling = SamplingConfig(tracks=6, seen=1.0, anywhere=0.0)  # all queries are in the first frame
     sizes = {"frames": 6, "sampling": sampling, "tracker": SIZES | {"time_depth": 2, "space_depth": 2}}  # two windows
     config = recipe(train_encoder=True, matching_steps=0, steps=2, evaluate_every=2, **sizes)
     logs = []
     for compiled in (False, True):
         held_out = [t3d.load_clip(clips[0])]
-        trainer = Trainer(tmp_path / f"{compiled}", config, clips, held_out, compiled=compiled)
-        searches = trainer.tracker.neighborhood  # boxes are for a CPU, where nobody compiles
+        trainer = make_trainer(tmp_path / f"{compiled}", config, clips, held_out, compiled=compiled)
+        searches = trainer.tracker.neighborhood  # boxes are for a CPU, which does not compile
         searches.search = MethodType(KNearest.search, searches)
         assert not graphs
         logs.append(list(trainer.steps()))

@@ -13,12 +13,7 @@ from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.n2n import N2N, PairAttention
 from tapip3d_lite.model.neighbors import KNearest, Neighbors, bilinear, knn
 from tapip3d_lite.model.updater import Transformer, token_width, trajectory_tokens
-
-SMALL = {
-    "image_size": (32, 48), "window": 4, "feature_dim": 8, "levels": 2, "neighbors": 3, "token_dim": 6,
-    "context_heads": 2, "context_head_dim": 3, "offset_layers": 2, "offset_dim": 7, "hidden": 12, "heads": 2,
-    "head_dim": 5, "time_depth": 2, "space_depth": 1, "virtual_tracks": 3,
-}  # fmt: skip
+from tests.tiny import SMALL
 
 
 @pytest.fixture(params=range(3))

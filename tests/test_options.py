@@ -21,7 +21,7 @@ from tapip3d_lite import __main__
 from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.stream import Stream
 from tapip3d_lite.model.track import track
-from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.training.recipe import TrainConfig
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data_samples" / "arc.npz"
 ELSEWHERE = {"from_official_state", "load_official"}  # without options; test_weights has the checkpoints that they need

@@ -1,4 +1,6 @@
-"""A step that asks the device for no number: the same gradients, and nothing that a CUDA graph could not hold."""
+"""A step that reads no number from the device: the same gradients, and nothing that a CUDA graph cannot hold."""
+
+from dataclasses import replace
 
 import pytest
 import torch
@@ -7,17 +9,15 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tapip3d_lite.model.blocks import DEGREES
 from tapip3d_lite.model.neighbors import KNearest
 from tapip3d_lite.speed.cuda_graph import CudaGraphStep
-from tapip3d_lite.training.sampling import SamplingConfig
+from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.trainer import Trainer
-from tests.test_trainer import clips, recipe
+from tests.tiny import recipe
 
-__all__ = ["clips"]
-
-ASKS = ("_local_scalar_dense", "nonzero", "lift_fresh", "unique", "masked_select", "is_nonzero")
+READS = ("_local_scalar_dense", "nonzero", "lift_fresh", "unique", "masked_select", "is_nonzero")
 
 
-class Asked(TorchDispatchMode):
-    """Operations that make a CPU wait for a GPU, or copy constants to it."""
+class Reads(TorchDispatchMode):
+    """Collects operations that make a CPU wait for a GPU, or copy constants to it."""
 
     def __enter__(self):
         self.names = []
@@ -25,7 +25,7 @@ class Asked(TorchDispatchMode):
 
     def __torch_dispatch__(self, function, types, arguments=(), options=None):
         name = str(function)
-        self.names += [name for ask in ASKS if ask in name]
+        self.names += [name for read in READS if read in name]
         if name.startswith("aten.index"):
             tensors = [x for part in arguments if isinstance(part, list | tuple) for x in part]
             self.names += [name for x in tensors if isinstance(x, torch.Tensor) and x.dtype == torch.bool]
@@ -34,9 +34,9 @@ class Asked(TorchDispatchMode):
 
 @pytest.fixture
 def trainer(tmp_path, clips, monkeypatch):
-    # The order of sums differs with masked tracks, and 2^13 x would make much of the last bit.
+    # The order of sums differs with masked tracks, and 2^13 x would magnify the last bit.
     monkeypatch.setattr("tapip3d_lite.model.blocks._SCALES", tuple(2.0 ** min(degree, 2) for degree in DEGREES))
-    # Some tracks are asked for so late that they do not belong to the first window.
+    # Some tracks have their query so late that they do not belong to the first window.
     late = {"sampling": SamplingConfig(tracks=6, anywhere=1.0, seen=0.0), "frames": (8, 8), "batch": 2}
     config = recipe(matching_steps=0, train_encoder=True, **late)
     trainer = Trainer(tmp_path, config, clips)
@@ -46,8 +46,8 @@ def trainer(tmp_path, clips, monkeypatch):
 
 def gradients(trainer, batch):
     trainer.optimizer.zero_grad()
-    told = trainer._track(batch)
-    return told, [p.grad.clone() for p in trainer.parameters if p.grad is not None]
+    line = trainer._track(batch)
+    return line, [p.grad.clone() for p in trainer.parameters if p.grad is not None]
 
 
 def alike(some, others):
@@ -58,23 +58,23 @@ def alike(some, others):
 def test_a_steady_step_has_the_same_gradients(trainer):
     batch = trainer.example()
     assert int(batch.truth.times.max()) >= 4  # so that some tracks join later
-    told, plain = gradients(trainer, batch)
+    line, plain = gradients(trainer, batch)
     trainer._replay = trainer._add_gradients
-    told_steady, steady = gradients(trainer, batch)
-    assert told_steady == pytest.approx(told, rel=1e-5) and not trainer.tracker.sync_free
+    steady_line, steady = gradients(trainer, batch)
+    assert steady_line == pytest.approx(line, rel=1e-5) and not trainer.tracker.sync_free
     assert alike(plain, steady)
 
 
-def test_a_steady_step_asks_for_nothing(trainer):
+def test_a_steady_step_reads_no_number_from_the_device(trainer):
     batch = trainer.example().to("cpu")
     trainer._add_gradients(batch, 2)  # constants are made
-    with Asked() as asked:
+    with Reads() as reads:
         trainer._add_gradients(batch, 2)
-    assert {"aten._local_scalar_dense.default", "aten.nonzero.default"} <= set(asked.names)  # an ordinary one does
+    assert {"aten._local_scalar_dense.default", "aten.nonzero.default"} <= set(reads.names)  # an ordinary one does
     trainer._replay = trainer._add_gradients
-    with Asked() as asked:
+    with Reads() as reads:
         trainer._add_gradients(batch, 2)
-    assert not asked.names
+    assert not reads.names
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -111,15 +111,15 @@ def test_a_recording_is_made_for_each_length_and_gets_each_batch(trainer, monkey
 
         return Graph(), inputs, results, gradients
 
-    batches = [trainer.examples.batch(step) for step in range(3)]
+    batches = [trainer.examples.batch(step, step) for step in range(3)]
     expected = [gradients(trainer, batch) for batch in batches]
     monkeypatch.setattr(CudaGraphStep, "_record", record)
     trainer._replay = CudaGraphStep(trainer._add_gradients, trainer.parameters)
-    for batch, (told, plain) in zip(batches, expected, strict=True):
+    for batch, (line, plain) in zip(batches, expected, strict=True):
         again, replayed = gradients(trainer, batch)
-        assert again == pytest.approx(told, rel=1e-5)
+        assert again == pytest.approx(line, rel=1e-5)
         assert alike(plain, replayed)
     assert len(made) == len(set(made)) == 1
-    trainer.step = next(s for s in range(50) if trainer.examples.lengths(s)[1] != made[0][1])
-    gradients(trainer, batches[0])
+    longer = replace(batches[0], iterations=made[0][1] + 1)
+    gradients(trainer, longer)
     assert len(made) == len(set(made)) == 2

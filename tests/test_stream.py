@@ -7,7 +7,7 @@ import torch
 import tapip3d_lite as t3d
 from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.recorder import Recorder
-from tests.test_switches import SYSTEMS
+from tests.tiny import SYSTEMS
 
 SMALL = {"image_size": (48, 48), "window": 4, "levels": 2, "neighbors": 4, "iterations": 2}
 

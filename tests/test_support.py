@@ -8,7 +8,7 @@ from tapip3d_lite.model.frames import Frames, frames_from_clip
 from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.windows import query_support
 from tapip3d_lite.speed.cuda_graph import support_at_once
-from tests.test_trainer import SIZES
+from tests.tiny import SIZES
 
 WINDOW = {"neighborhood": "window", "context": "correlation", "neighbors": 9, "space": "uvd"}
 

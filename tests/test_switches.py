@@ -14,6 +14,7 @@ from tapip3d_lite.variants.image_spaces import UV, UVD, UVLogD
 from tapip3d_lite.variants.p2n import P2N
 from tapip3d_lite.variants.planes import EXTENT, PlaneCorrelation, PlaneNeighborhood, splat
 from tapip3d_lite.variants.window2d import WindowNeighborhood
+from tests.tiny import SYSTEMS
 
 TINY = {"image_size": (48, 48), "window": 4, "levels": 2, "iterations": 1, "feature_dim": 16, "token_dim": 16}
 
@@ -238,17 +239,6 @@ def test_uv_is_lifted_by_the_depth_where_it_ends_and_holes_by_the_nearest_depth(
     z = torch.stack([d[:, 12, 10], torch.full((3,), 7.5), d[:, 0, 47]], -1)
     torch.testing.assert_close(world, t3d.geometry.unproject(coords[..., :2], z, k, e), atol=1e-5, rtol=1e-5)
     assert torch.isfinite(UV().to_world(coords * torch.nan, k, e, d * 0)).sum() == 0  # NaN in, NaN out, no crash
-
-
-SYSTEMS = {
-    "uvd": {"space": "uvd", "neighbors": 12},
-    "uvlogd": {"space": "uvlogd"},
-    "fixed neighbours in 2D": {"neighborhood": "window", "neighbors": 12},
-    "without N2N": {"context": "p2n", "space": "camera"},
-    "CoTracker3-like": {"space": "uv", "neighborhood": "window", "context": "correlation"},
-    "DELTA-like": {"space": "uvlogd", "neighborhood": "window", "context": "correlation", "depth_ratio": True},
-    "SpatialTracker-like": {"space": "uvd", "neighborhood": "planes", "context": "planes", "updater": "temporal"},
-}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SYSTEMS)

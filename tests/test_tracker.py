@@ -21,7 +21,7 @@ from tapip3d_lite.model.tracker import Tracker, TrackerConfig
 from tapip3d_lite.model.windows import State, window_ends
 from tapip3d_lite.official import from_official_state, parameter_names
 from tests import parity
-from tests.test_model import SMALL
+from tests.tiny import SMALL
 
 
 @pytest.fixture(scope="module")

@@ -12,69 +12,19 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from tapip3d_lite.simulate import simulate_dataset
+from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
+from tapip3d_lite.lab import make_trainer
 from tapip3d_lite.training.augment import AugmentConfig
-from tapip3d_lite.training.config import TrainConfig
-from tapip3d_lite.training.journal import read_log
-from tapip3d_lite.training.matching import MatchingConfig, draw_pair
+from tapip3d_lite.training.data import SamplingConfig, load_part
 from tapip3d_lite.training.motion import MotionConfig
-from tapip3d_lite.training.sampling import SamplingConfig, load_part
+from tapip3d_lite.training.pretrain import MatchingConfig, draw_pair
+from tapip3d_lite.training.recipe import TrainConfig
+from tapip3d_lite.training.run_folder import read_log
 from tapip3d_lite.training.trainer import Trainer
-
-ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
-SIZES |= {"context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2}
-SIZES |= {"time_depth": 1, "space_depth": 1, "virtual_tracks": 4}
+from tests.tiny import ROOT, SIZES, checkpoint, recipe, start, wait_for
 
 
-def recipe(**changes):
-    settings = {"tracker": SIZES, "frames": (4, 6), "sampling": SamplingConfig(tracks=6), "save_every": 3}
-    settings |= {"matching_steps": 4, "steps": 12, "evaluate_every": 100, "validation": 0}
-    return TrainConfig(**(settings | changes))
-
-
-@pytest.fixture(scope="module")
-def clips(tmp_path_factory):
-    config = t3d.SimulationConfig(frames=8, size=(32, 32), tracks=24)
-    return simulate_dataset(tmp_path_factory.mktemp("clips"), 3, config, workers=1, progress=False)
-
-
-def state(folder):
-    return torch.load(folder / "checkpoint.pt", weights_only=True)["model"]
-
-
-RUN = """
-import sys, torch
-from pathlib import Path
-from tests.test_trainer import recipe
-from tapip3d_lite.lab.train import interruptible
-from tapip3d_lite.training.trainer import Trainer
-torch.set_num_threads(1)
-trainer = Trainer(sys.argv[1], recipe(), sorted(Path(sys.argv[2]).glob("*.npz")), resume=True)
-with interruptible() as stop:
-    done = trainer.run(stop, watch=lambda line: print(line["step"], flush=True), progress=False)
-sys.exit(0 if done else 130)
-"""
-
-
-def start(folder, clips):
-    return subprocess.Popen(
-        [sys.executable, "-c", RUN, str(folder), str(clips[0].parent)],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-
-
-def wait_for(process, step):
-    for line in process.stdout:
-        if int(line) >= step:
-            return
-    raise AssertionError("ended before that step")
-
-
-def test_continuing_after_a_kill_changes_no_bit(tmp_path, clips):
-    torch.set_num_threads(1)
+def test_continuing_after_a_kill_changes_no_bit(tmp_path, clips, one_thread):
     Trainer(tmp_path / "whole", recipe(), clips).run(progress=False)
     with start(tmp_path / "killed", clips) as process:
         wait_for(process, 8)  # checkpoints stand at 3, 6, 9, ...
@@ -84,7 +34,7 @@ def test_continuing_after_a_kill_changes_no_bit(tmp_path, clips):
     trainer = Trainer(tmp_path / "killed", recipe(), clips, resume=True)
     assert 0 < trainer.step < 16
     assert trainer.run(progress=False)
-    whole, killed = state(tmp_path / "whole"), state(tmp_path / "killed")
+    whole, killed = checkpoint(tmp_path / "whole"), checkpoint(tmp_path / "killed")
     assert all(torch.equal(whole[name], killed[name]) for name in whole)
     logs = [
         [{k: v for k, v in line.items() if k != "seconds"} for line in read_log(tmp_path / x)]
@@ -145,6 +95,10 @@ def _gradients(rank, size, folder, clips, batch):
         address = f"file://{folder}/meet"
         torch.distributed.init_process_group("gloo", init_method=address, rank=rank, world_size=size)
     trainer = Trainer(f"{folder}/{size}_{rank}", recipe(matching_steps=0, batch=batch), clips)
+    with torch.no_grad():
+        for parameter in trainer.parameters:
+            parameter += rank  # so only the main process has the weights of the other training
+    trainer.group.copy_from_main(trainer.tracker.parameters())
     trainer.optimizer.zero_grad()
     trainer._track(trainer.example())
     trainer.group.average(trainer.parameters)
@@ -165,7 +119,7 @@ def test_two_processes_give_the_gradients_of_one_with_twice_the_batch(tmp_path, 
         torch.testing.assert_close(a, c, rtol=1e-3, atol=1e-6)
 
 
-def test_torchrun_founds_one_training_for_all_processes(tmp_path):
+def test_torchrun_makes_one_training_of_all_processes(tmp_path):
     options = "--clips 2 --matching-steps 1 --steps 2 --frames 8 8 --iterations 1 1 --validation 0 --sampling.tracks 8"
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
     command = [*torchrun, "-m", "tapip3d_lite", "train", "--out", str(tmp_path), *options.split()]
@@ -177,22 +131,41 @@ def test_torchrun_founds_one_training_for_all_processes(tmp_path):
     assert again.returncode != 0 and "--resume" in again.stderr
 
 
+def test_held_out_clips_are_scored_on_time(tmp_path, clips):
+    seen = []
+
+    def validate(tracker):
+        seen.append((trainer.step, tracker.training))
+        return {"val_x": float(len(seen))}
+
+    trainer = Trainer(tmp_path / "own", recipe(evaluate_every=5), clips, validate)
+    modes = [trainer.tracker.training for _ in trainer.steps()]
+    assert seen == [(9, False), (14, False), (16, False)] and all(modes)  # steps 5, 10 and 12 of tracking
+    assert {line["step"]: line.get("val_x") for line in read_log(tmp_path / "own")[8::5]} == {9: 1.0, 14: 2.0}
+    held_out = [t3d.load_clip(path) for path in clips[:2]]
+    trainer = make_trainer(tmp_path / "made", recipe(matching_steps=0, steps=1), clips, held_out)
+    (line,) = trainer.steps()
+    scores = mean_scores([evaluate(trainer.tracker.eval().track(clip), clip) for clip in held_out])
+    names = {name for name in line if name.startswith("val_")}
+    assert len(names) == 6 and all(line[name] == round(scores[name.removeprefix("val_")], 4) for name in names)
+
+
 def test_weights_to_start_from(tmp_path, clips):
     first = Trainer(tmp_path / "first", recipe(), clips)
     t3d.save_weights(first.tracker, tmp_path / "w.safetensors")
-    start = {"init": str(tmp_path / "w.safetensors"), "seed": 1}
-    second = Trainer(tmp_path / "second", recipe(**start), clips)
-    chance = Trainer(tmp_path / "chance", recipe(seed=1), clips)
-    states = [x.tracker.state_dict() for x in (first, second, chance)]
+    init = {"init": str(tmp_path / "w.safetensors"), "seed": 1}
+    second = Trainer(tmp_path / "second", recipe(**init), clips)
+    random = Trainer(tmp_path / "random", recipe(seed=1), clips)
+    states = [x.tracker.state_dict() for x in (first, second, random)]
     assert all(torch.equal(x, states[1][name]) for name, x in states[0].items())
     assert not all(torch.equal(x, states[2][name]) for name, x in states[0].items())
     with pytest.raises(ValueError, match="other sizes"):
-        Trainer(tmp_path / "third", recipe(**start, tracker=SIZES | {"hidden": 16}), clips)
+        Trainer(tmp_path / "third", recipe(**init, tracker=SIZES | {"hidden": 16}), clips)
     with pytest.raises(ValueError, match="static: no such file"):
         Trainer(tmp_path / "fourth", recipe(init="static"), clips)
 
 
-def test_a_disk_without_room_for_the_features_is_told_first(tmp_path, clips, monkeypatch):
+def test_a_disk_without_room_for_the_features_is_noticed_before_training(tmp_path, clips, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=3 * 8 * 16 * 16 * 16 * 2 - 1))
     with pytest.raises(ValueError, match=r"features of 3 clips take 0\.0 GB.*use fewer clips"):
         Trainer(tmp_path, recipe(), clips)
@@ -223,27 +196,23 @@ def test_recipes_that_cannot_work(wrong):
 
 
 def test_the_papers_recipe_takes_a_tiny_step(tmp_path, clips):
-    paper = TrainConfig.recipe("paper")
-    assert (paper.lr, paper.clip_norm, paper.iterations, paper.frames) == (5e-4, 10.0, (4, 4), (24, 24))
-    assert paper.augment and paper.tracker_config().image_size == (384, 512)
     sizes = SIZES | {"image_size": (32, 48)}  # clips are 32x32: they are brought to the tracker's size
     small = {"tracker": sizes, "frames": (6, 6), "sampling": SamplingConfig(tracks=12), "validation": 0}
     trainer = Trainer(tmp_path, TrainConfig.recipe("paper", **small, matching_steps=1, steps=1), clips)
     before = {name: p.clone() for name, p in trainer.tracker.named_parameters()}
     assert trainer.run(progress=False)
     matching, tracking = read_log(tmp_path)
-    assert matching["right"] is not None and tracking["loss"] > 0 and trainer.examples.draw(1, 0)[0].size == (32, 48)
+    assert matching["right"] is not None and tracking["loss"] > 0 and trainer.examples.draw(1, 0, 6)[0].size == (32, 48)
     changed = {name.split(".")[0] for name, p in trainer.tracker.named_parameters() if not torch.equal(p, before[name])}
     assert {"encoder", "updater"} <= changed
 
 
-def test_augmentation_changes_what_is_drawn_only_where_it_is_asked_for(tmp_path, clips):
+def test_only_a_recipe_with_augmentation_changes_the_clips(tmp_path, clips):
     options = {"train_encoder": True, "matching_steps": 0}
     plain = Trainer(tmp_path / "plain", recipe(**options), clips)
     changed = Trainer(tmp_path / "changed", recipe(**options, augment=True), clips)
-    different = [
-        not np.array_equal(plain.examples.draw(s, 0)[0].depths, changed.examples.draw(s, 0)[0].depths) for s in range(8)
-    ]
+    pairs = [[trainer.examples.draw(step, 0, 4)[0].depths for trainer in (plain, changed)] for step in range(8)]
+    different = [not np.array_equal(*pair) for pair in pairs]
     assert sum(different) >= 7
     path, index = clips[0], np.arange(4)
     whole = t3d.load_clip(path)

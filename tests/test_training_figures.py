@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from tapip3d_lite.training.plan import fit_to_time
 
 import tapip3d_lite as t3d
 from lessons.n06 import LivePlot, learning_curve, tracks_and_truth, train_live
@@ -20,9 +21,8 @@ from tapip3d_lite.figures.curves import learning_curves
 from tapip3d_lite.figures.flat import MOVING
 from tapip3d_lite.simulate import simulate_dataset
 from tapip3d_lite.training import plan
-from tapip3d_lite.training.config import TrainConfig
-from tapip3d_lite.training.plan import fit_to_time
-from tapip3d_lite.training.sampling import SamplingConfig
+from tapip3d_lite.training.data import SamplingConfig
+from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -23,7 +23,7 @@ from tapip3d_lite.figures.curves import Line, learning_curves
 from tapip3d_lite.figures.flat import MOVING, STILL, check_drawable, draw_image
 from tapip3d_lite.geometry import project
 from tapip3d_lite.lab.train import interruptible
-from tapip3d_lite.training.journal import read_log
+from tapip3d_lite.training.run_folder import read_log
 from tapip3d_lite.training.trainer import Trainer
 
 __all__ = [

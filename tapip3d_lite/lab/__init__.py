@@ -1,1 +1,5 @@
 """Experiments under equal conditions; what needs both training and evaluation."""
+
+from tapip3d_lite.lab.train import held_out_scores, make_trainer
+
+__all__ = ["held_out_scores", "make_trainer"]

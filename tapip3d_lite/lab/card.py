@@ -8,8 +8,8 @@ from pathlib import Path
 from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, difference_table, load_results, summary_table
 from tapip3d_lite.model.weights import load_weights
 from tapip3d_lite.training.augment import augmentations
-from tapip3d_lite.training.config import TrainConfig
-from tapip3d_lite.training.journal import read_log
+from tapip3d_lite.training.recipe import TrainConfig
+from tapip3d_lite.training.run_folder import read_log
 
 _LIMITS = """- Trained on simulated clips of rigid bodies in rooms, at most {frames} frames an example and images of {height}x{width}
   pixels; on real footage, soft bodies or much longer clips this card measures nothing.
@@ -31,10 +31,10 @@ def model_card(
     Args:
         folder: of the training: `config.json`, `log.jsonl`, `weights.safetensors`.
         results: JSON that `benchmark --out` wrote.
-        hardware: what it was trained on, in words; files cannot know.
-        name: what the model is called.
-        command: that made it; None: the one that the recipe amounts to.
-        weights: the file, if not the folder's own.
+        hardware: on which it was trained, in words.
+        name: of the model.
+        command: that made it; None: the one with this recipe's options.
+        weights: another file than the folder's own.
 
     Returns:
         The text.
@@ -80,7 +80,7 @@ def _table(scores: dict, part: str) -> str:
 
 
 def _differences(scores: dict, labels: list[str], name: str) -> list[str]:
-    """Where the model's first results and others' are on the same clips: how much better it is, clip by clip."""
+    """Tables of the differences to other trackers, paired by clip."""
     own = [label for label in labels if label.rpartition(" · ")[0] == name or label == name]
     others = [label for label in labels if label not in own]
     if not own or not others:
@@ -101,9 +101,7 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -
         + (f"; set by hand: {', '.join(f'{k}={v}' for k, v in config.tracker.items())}" if config.tracker else ""),
         "data": f"{config.clips} simulated clips; examples of {_range(config.frames)} frames and {config.sampling.tracks} "
         f"tracks; images {_changes(config)}",
-        "steps": f"{min(log[-1]['step'], config.matching_steps)} of matching, "
-        f"{max(log[-1]['step'] - config.matching_steps, 0)} of tracking, batches of {config.batch} in each process"
-        + (f"; stopped at step {log[-1]['step']} of {config.total}" if log[-1]["step"] < config.total else ""),
+        "steps": _steps(config, log),
         "recipe": f"AdamW {config.lr:g}, weight decay {config.weight_decay:g}, one cycle, M = {_range(config.iterations)}, "
         f"{config.precision}, encoder {'trained along' if config.train_encoder else 'frozen after matching'}, seed {config.seed}"
         + (f"; errors softened from {config.loss.soften:g} pixels on" if config.loss.soften else ""),
@@ -121,6 +119,14 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -
     return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows.items())
 
 
+def _steps(config: TrainConfig, log: list[dict]) -> str:
+    last, matching = log[-1]["step"], sum(line["stage"] == "matching" for line in log)
+    text = f"{matching} of matching, {last - matching} of tracking, batches of {config.batch} in each process"
+    if config.minutes is not None:
+        return f"{text}; as many as {config.minutes:g} minutes allowed"
+    return f"{text}; stopped at step {last} of {config.total}" if last < config.total else text
+
+
 def _changes(config: TrainConfig) -> str:
     made = [name for name, (share, _) in augmentations(config.augmentation).items() if share > 0]
     return f"augmented ({', '.join(made)})" if config.augment else "not augmented"
@@ -131,16 +137,16 @@ def _range(pair: tuple[int, int]) -> str:
 
 
 def _trackers(labels: list[str]) -> str:
-    """Names for `--tracker`: a learnt one is labelled once a space."""
+    """Names for `--tracker`, from labels of which a learnt tracker has one for each space."""
     return " ".join(dict.fromkeys(label.rpartition(" · ")[0] or label for label in labels))
 
 
 def _flags(config: TrainConfig) -> str:
-    """What the recipe sets otherwise than its preset does, as options."""
+    """Options for the fields in which the recipe differs from its preset's."""
     default, own = TrainConfig.recipe(config.preset).to_dict(), config.to_dict()
     flags = "" if config.preset == "lite" else f" --preset {config.preset}"
     for name, value, usual in _leaves(own, default):
-        if name == "tracker":  # sizes of images are no plain value for the command line; the table names them
+        if name == "tracker":  # sizes of images cannot be given on the command line; the table names them
             plain = [f"{k} {v}" for k, v in value.items() if not isinstance(v, list | tuple)]
             flags += f" --tracker {' '.join(plain)}" if plain else ""
         elif value != usual:

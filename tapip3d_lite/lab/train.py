@@ -1,4 +1,4 @@
-"""`python -m tapip3d_lite train`: make the clips, train, stop cleanly on Ctrl-C, say what came out."""
+"""Training with held-out scores: `make_trainer` for a program, `train` for the command `python -m tapip3d_lite train`."""
 
 from __future__ import annotations
 
@@ -6,16 +6,54 @@ import contextlib
 import json
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import distributed
 
-from tapip3d_lite.training.config import TrainConfig
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
+from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.training.data import training_clips, validation_clips
-from tapip3d_lite.training.journal import Journal
+from tapip3d_lite.training.recipe import TrainConfig
+from tapip3d_lite.training.run_folder import RunFolder
 from tapip3d_lite.training.trainer import Trainer
+
+_SCORES = ("AJ3D_none", "APD3D_none", "OA", "AJ3D_none_dynamic", "APD3D_none_dynamic", "APD3D_none_static")
+
+
+def held_out_scores(clips: Sequence[Clip]) -> Callable[[Tracker], dict[str, float]]:
+    """A function that gives a tracker's mean scores on held-out clips in world space, with names that begin `val_`.
+
+    Args:
+        clips: with true tracks; not trained on.
+    """
+
+    def validate(tracker: Tracker) -> dict[str, float]:
+        scores = mean_scores([evaluate(tracker.track(clip), clip) for clip in clips])
+        return {f"val_{name}": round(scores[name], 4) for name in _SCORES}
+
+    return validate
+
+
+def make_trainer(
+    folder: str | Path, config: TrainConfig, clips: Sequence[Path], validation: Sequence[Clip] = (), **options: Any
+) -> Trainer:
+    """A trainer that also scores the tracker on held-out clips, every `config.evaluate_every` steps.
+
+    Args:
+        folder: of the training; made if missing.
+        config: the recipe.
+        clips: training clips (npz files with tracks) of any image size.
+        validation: held-out clips with true tracks; none: the tracker is not scored.
+        options: of `Trainer`: `device`, `resume`, `workers`, `compiled`.
+
+    Raises:
+        ValueError: as `Trainer` does.
+    """
+    return Trainer(folder, config, clips, held_out_scores(validation) if validation else None, **options)
 
 
 def train(
@@ -34,17 +72,18 @@ def train(
         out: the training's folder.
         config: the recipe; with `resume` the folder's own recipe is used instead.
         data: folder of the clips, shared by trainings; `out / "clips"` if None. Missing clips are simulated.
-        resume: continue.
+        resume: continue from the folder's checkpoint.
         device: `"cpu"` or `"cuda"`.
-        workers: see `Trainer`; None: none on a CPU, which they would take from training, else cores less two.
-        compiled: see `Trainer`.
+        workers: processes that make examples ahead of time; None: none on a CPU, which needs its cores for the training
+            itself, else the number of cores less two.
+        compiled: compile the tracker's parts (GPU).
         progress: show bars.
 
     Returns:
-        Whether it is finished, and what to tell the user.
+        Whether the training is finished, and a message for the user.
 
     Raises:
-        ValueError: see `Trainer`; also for a GPU that is not there, or compiling without one.
+        ValueError: as `Trainer` does; also without a GPU for `device="cuda"`, and for compiling without a GPU.
     """
     recipe = Path(out) / "config.json"
     if resume and recipe.exists():
@@ -58,35 +97,37 @@ def train(
         cores = (os.cpu_count() or 2) // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
         workers = 0 if device == "cpu" else max(1, cores - 2)
     large = config.tracker_config().image_size > (128, 128)
-    with _processes(device) as leads:
-        progress = progress and leads
-        if leads:
+    with _processes(device) as is_main:
+        progress = progress and is_main
+        if is_main:
             clips = training_clips(data / "train", config.clips, progress, large=large)
             held_out = validation_clips(data / "validation", config.validation, progress) if config.validation else []
-            Journal(out, config, resume)  # refuses, or founds the folder, once for all processes
+            RunFolder(out, config, resume)  # checked, and made, once for all processes
         _wait()
-        if not leads:
+        if not is_main:
             clips, held_out = training_clips(data / "train", config.clips, False, large=large), []
         if device == "cuda" and config.precision == "bfloat16":
             torch.set_float32_matmul_precision("high")  # TF32, for what is left in float32
-        trainer = Trainer(out, config, clips, held_out, device, True, workers, compiled)
+        options = {"device": device, "resume": True, "workers": workers, "compiled": compiled}
+        trainer = make_trainer(out, config, clips, held_out, **options)
         with interruptible() as stop:
             finished = trainer.run(stop, progress=progress)
-        _wait()  # for the leader, which writes the weights
+        _wait()  # for the main process, which writes the weights
     if finished:
         return True, f"finished: {Path(out) / 'weights.safetensors'}"
-    return False, f"stopped and saved at step {trainer.step} of {config.total}; continue with --resume"
+    done = f"step {trainer.step} of {config.total}" if config.minutes is None else f"step {trainer.step}"
+    return False, f"stopped and saved at {done}; continue with --resume"
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C into a wish to stop, so that a step is never cut in two; the second one interrupts."""
-    wishes = []
+    """Yield a function that is true after the first Ctrl-C, so that a step is completed; the second one interrupts."""
+    signals = []
 
     def handle(number: int, frame: object) -> None:
-        if wishes:
+        if signals:
             raise KeyboardInterrupt
-        wishes.append(number)
+        signals.append(number)
 
     try:
         before = signal.signal(signal.SIGINT, handle)
@@ -94,14 +135,14 @@ def interruptible() -> Iterator[Callable[[], bool]]:
         yield lambda: False
         return
     try:
-        yield lambda: bool(wishes)
+        yield lambda: bool(signals)
     finally:
         signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager
 def _processes(device: str) -> Iterator[bool]:
-    """Join the processes that torchrun started, if it did; yields whether this one leads."""
+    """Join the processes that torchrun started, if it did; yields whether this is the main one."""
     if "RANK" not in os.environ:
         yield True
         return

@@ -1,9 +1,9 @@
 """Backpropagation whose memory grows neither with the number of updates nor with the number of windows.
 
-Paper, section 3.5 ("memory"): estimates are detached after every update, so each update's loss reaches back only
-through that update. Its graph can therefore be walked and freed at once. What several updates share is treated as input:
-tokens of the cloud and of the queries are leaves that collect their gradients until a window is done, image features
-until the end; then what made them is backpropagated, once.
+Estimates are detached after every update (paper and released code), so the loss of an update has gradients through this
+update only, and its graph can be backpropagated and freed at once. Tensors that several updates use become leaves, which
+add up gradients: tokens of the cloud and of the queries until the end of a window, image features until the end of the
+clip. What computed them is then backpropagated once.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
 
 
 def saving_backward(tracker: Tracker, *arguments: Any, **options: Any) -> dict[str, float]:
-    """As `add_gradients`; returns `position` and `visibility`, the two parts of the loss, and their sum `loss`."""
+    """Call `add_gradients`, and return the loss by name: `position`, `visibility` and their sum `loss`."""
     return losses(add_gradients(tracker, *arguments, **options))
 
 
@@ -36,7 +36,7 @@ def add_gradients(
     watch: Callable[[Step], None] | None = None,
     **options: Any,
 ) -> Tensor:
-    """Add the gradients of the whole loss to the parameters, one update at a time.
+    """Add the gradients of the whole loss to the parameters' gradients, one update at a time.
 
     Args:
         tracker: in training mode.
@@ -45,7 +45,7 @@ def add_gradients(
         truth: of the same tracks.
         config: weights of the loss.
         features: (B, T, C, h, w) of an encoder that is not trained along; None: encode the frames.
-        watch: called with every update before it is forgotten.
+        watch: called with every update before its tensors are freed.
         options: of `Tracker.steps`, e.g. `active`, `iterations`, `space`.
 
     Returns:
@@ -69,19 +69,19 @@ def add_gradients(
 
 
 def losses(parts: Tensor) -> dict[str, float]:
-    """Names for what `add_gradients` returns; asking a GPU for numbers waits for it."""
+    """The loss by name, from the tensor (2,) of `add_gradients`; this waits for the GPU."""
     position, visibility = parts.tolist()
     return {"loss": position + visibility, "position": position, "visibility": visibility}
 
 
 class Leaves:
-    """Stand-ins for tensors, which collect gradients until it is worth going back further."""
+    """Detached copies of tensors, which add up gradients until `backward` sends these on to the tensors."""
 
     def __init__(self) -> None:
         self._pairs: list[tuple[Tensor, Tensor]] = []
 
     def of(self, tensor: Tensor) -> Tensor:
-        """A leaf with the values of a tensor; the tensor itself if no gradient flows through it."""
+        """A leaf with the values of a tensor; the tensor itself if it needs no gradient."""
         if not tensor.requires_grad:
             return tensor
         leaf = tensor.detach().requires_grad_()
@@ -89,7 +89,7 @@ class Leaves:
         return leaf
 
     def shared(self, window: Window) -> Window:
-        """The window with leaves for all that its updates share."""
+        """The window with leaves in place of all tensors that its updates share."""
         levels = [replace(x, features=self.of(x.features), extra=self._all(x.extra)) for x in window.levels]
         return replace(window, levels=levels, kept=[self._all(kept) for kept in window.kept])
 
@@ -103,7 +103,7 @@ class Leaves:
         return value.map(self.of) if hasattr(value, "map") else value
 
     def backward(self, retain_graph: bool = False) -> None:
-        """Send what was collected back to where the tensors come from, and begin anew."""
+        """Backpropagate the collected gradients from the tensors on, and forget these tensors."""
         pairs = [(tensor, leaf.grad) for tensor, leaf in self._pairs if leaf.grad is not None]
         self._pairs = []
         if pairs:
@@ -113,7 +113,7 @@ class Leaves:
 def plain_backward(
     tracker: Tracker, frames: Frames, queries: Tensor, truth: Truth, config: LossConfig, **options: Any
 ) -> dict[str, float]:
-    """The same gradients the usual way: sum the losses of all updates, then walk everything at once."""
+    """The same gradients by their definition: sum the losses of all updates, then backpropagate everything at once."""
     iterations = options.get("iterations") or tracker.config.iterations
     steps = tracker.steps(frames, queries, features=tracker.encoder(frames.rgb), **options)
     parts = [torch.stack(step_loss(step, truth, iterations, config)) for step in steps]

@@ -1,7 +1,8 @@
-"""What a tracker is trained on: which clips, which part of a clip, which of its points, in which coordinates.
+"""What a tracker is trained on: which clips, which frames and points of a clip, and how they become a batch.
 
-Paper: appendix (training data). Everything that is drawn for step s comes from a generator seeded by (seed, s), so a
-run that is continued draws what it would have drawn.
+Paper: appendix (training). Tracks that are visible in at least a fifth of the frames; queries in the first visible
+frame, one in four in a random visible frame; half of the clips are played backward. The paper's clips are Kubric's;
+ours are simulated.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tapip3d_lite.clip import Clip, load_clip
+from tapip3d_lite.clip import Clip, Tracks, load_clip
 from tapip3d_lite.files import atomic_path, load_npz
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.encoder import Encoder
@@ -27,7 +28,7 @@ from tapip3d_lite.training.loss import Truth
 
 
 def training_config(seed: int) -> SimulationConfig:
-    """The training clip of a seed: all cameras, with and without occluder and sky, slow and fast, 12 or 24 fps."""
+    """The settings of a seed's training clip: any camera, with or without occluder and sky, slow or fast, 12 or 24 fps."""
     rng = np.random.default_rng([7, seed])
     return SimulationConfig(
         fps=float(rng.choice([12.0, 12.0, 24.0])),
@@ -45,14 +46,14 @@ def training_config(seed: int) -> SimulationConfig:
 
 
 def large_training_config(seed: int) -> SimulationConfig:
-    """The same clip at the size of the paper's model, with more points."""
+    """The same settings at the image size of the paper's model, with more points."""
     return replace(training_config(seed), size=(384, 512), tracks=768)
 
 
 def training_clips(
     folder: str | Path, count: int, progress: bool = True, workers: int | None = None, large: bool = False
 ) -> list[Path]:
-    """The paths of the first `count` training clips, 128x128 or `large`; those that are missing are simulated."""
+    """The paths of the first `count` training clips, 128x128 or `large`; missing ones are simulated."""
     if not 0 < count <= len(TRAINING):
         raise ValueError(f"training_clips: count must be in [1, {len(TRAINING)}], got {count}")
     config = large_training_config if large else training_config
@@ -60,7 +61,7 @@ def training_clips(
 
 
 def validation_clips(folder: str | Path, count: int, progress: bool = True) -> list[Clip]:
-    """Held-out clips of the same kind, never trained on; at 12 fps, 64 tracks each."""
+    """Held-out clips with other seeds than any training clip; at 12 fps, 64 tracks each."""
     paths = simulate_dataset(folder, count, _validation_config, VALIDATION.start, None, progress)
     return [load_clip(path) for path in paths]
 
@@ -70,17 +71,131 @@ def _validation_config(seed: int) -> SimulationConfig:
 
 
 @dataclass(frozen=True)
-class Batch:
-    """B clips of equal length with their truth.
+class SamplingConfig:
+    """Which points of a clip are tracked, and from which frame on.
 
     Attributes:
-        frames: (B, T), with colours as bytes until `to` has brought them to a device; black where features are given.
-        queries: (B, N, 4).
+        tracks: N, number of tracks.
+        seen: a point must be visible in at least this share of the example's frames.
+        anywhere: share of the queries in a random frame that shows the point; the others are in the first such frame.
+        backward: share of the examples that are played backward.
+
+    Raises:
+        ValueError: no tracks, or a share outside [0, 1].
+    """
+
+    tracks: int = 48
+    seen: float = 0.2
+    anywhere: float = 0.25
+    backward: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.tracks < 1 or not all(0 <= x <= 1 for x in (self.seen, self.anywhere, self.backward)):
+            raise ValueError(f"SamplingConfig: tracks must be positive and shares in [0, 1], got {self}")
+
+
+def draw_frames(rng: np.random.Generator, available: int, wanted: int, backward: float) -> np.ndarray:
+    """Draw consecutive frames, sometimes from last to first.
+
+    Args:
+        rng: random generator.
+        available: number of frames of the clip.
+        wanted: T, number of frames of the example.
+        backward: probability of the order from last to first.
+
+    Returns:
+        Frame indices (T,).
+
+    Raises:
+        ValueError: fewer frames are available than wanted.
+    """
+    if wanted > available:
+        raise ValueError(f"frames: an example needs {wanted} frames, the clip has {available}; lower frames")
+    start = int(rng.integers(available - wanted + 1))
+    index = np.arange(start, start + wanted)
+    return index[::-1].copy() if rng.random() < backward else index
+
+
+def _query_rows(xyz: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Query rows (N, 4) of tracks xyz (T, N, 3) at frames times (N,)."""
+    return np.concatenate([times[:, None], xyz[times, np.arange(len(times))]], -1).astype(np.float32)
+
+
+def sample_tracks(clip: Clip, rng: np.random.Generator, config: SamplingConfig) -> Clip:
+    """Draw N of a clip's tracks and the frames of their queries.
+
+    Args:
+        clip: with tracks.
+        rng: random generator.
+        config: how many, and which.
+
+    Returns:
+        The clip with exactly N tracks; where fewer are visible in enough frames, some appear more than once.
+
+    Raises:
+        ValueError: no track is visible in enough frames.
+    """
+    visible = clip.tracks.visible
+    good = np.flatnonzero(visible.mean(0) >= max(config.seen, 1 / len(visible)))
+    if not len(good):
+        raise ValueError(
+            f"sample_tracks: clip {clip.name!r} shows no track in {config.seen:.0%} of its frames; lower `seen`"
+        )
+    extra = rng.choice(good, max(config.tracks - len(good), 0))
+    chosen = rng.choice(np.concatenate([good, extra]), config.tracks, replace=False)
+    visible = visible[:, chosen]
+    times = visible.argmax(0)
+    for n in np.flatnonzero(rng.random(config.tracks) < config.anywhere):
+        times[n] = rng.choice(np.flatnonzero(visible[:, n]))
+    picked = clip.tracks.select(chosen)
+    queries = _query_rows(picked.xyz, times)
+    return replace(clip, queries=queries, tracks=replace(picked, queries=queries))
+
+
+def load_part(
+    path: str | Path, choose: Callable[[int], np.ndarray], colours: bool = True, size: tuple[int, int] | None = None
+) -> Clip:
+    """Load some frames of a stored clip, with the tracks visible in them; each query is in the first visible frame.
+
+    Args:
+        path: an npz file with tracks.
+        choose: takes the number of frames in the file, returns the indices (T,) of those wanted, in any order.
+        colours: if False, the video is not read and stays black.
+        size: (H, W) of the result; None keeps the stored size.
+
+    Returns:
+        A clip of T frames.
+    """
+    arrays = load_npz(path, skip=() if colours else ("video",))
+    index = choose(len(arrays["depths"]))
+    frames = {name: arrays[name][index] for name in ("depths", "intrinsics", "extrinsics")}
+    video = arrays["video"][index] if colours else np.zeros((*frames["depths"].shape, 3), np.uint8)
+    xyz, visible = arrays["tracks"][index], arrays["visible"][index]
+    kept = visible.any(0)
+    xyz, visible = xyz[:, kept], visible[:, kept]
+    queries = _query_rows(xyz, visible.argmax(0))
+    dynamic = arrays["dynamic"][kept] if "dynamic" in arrays else None
+    tracks = Tracks(xyz, visible, queries, dynamic=dynamic)
+    clip = Clip(video, **frames, queries=queries, tracks=tracks, name=str(arrays["name"]), fps=float(arrays["fps"]))
+    if size in (None, clip.size):
+        return clip
+    resized = resize_clip(clip, size)
+    return replace(clip, video=resized.video, depths=resized.depths, intrinsics=resized.intrinsics, extras={})
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B clips of equal length with their true tracks.
+
+    Attributes:
+        frames: (B, T) frames; colours are bytes until `to` moves them to a device, and black where features are given.
+        queries: (B, N, 4) rows (t, x, y, z), world.
         truth: of the same tracks.
         dynamic: (B, N) bool, points on bodies that move in the world.
-        roi: depths (near, far), each (B, 1, 1, 1), that count for the scale.
+        roi: depths (near, far), each (B, 1, 1, 1), between which points count for the normalisation scale.
         features: (B, T, C, h, w) of a frozen encoder, or None.
-        names: which clips these are.
+        names: of the clips.
+        iterations: M, updates of each window in this step; None: the tracker's own number.
     """
 
     frames: Frames
@@ -90,9 +205,10 @@ class Batch:
     roi: tuple[Tensor, Tensor]
     features: Tensor | None
     names: tuple[str, ...]
+    iterations: int | None = None
 
     def to(self, device: torch.device | str) -> Batch:
-        """The batch on a device, ready to be tracked."""
+        """The batch on a device, with colours and features as float32."""
         batch = self.map(lambda x: x.to(device))
         features = None if batch.features is None else batch.features.float()
         rgb = batch.frames.rgb
@@ -100,21 +216,23 @@ class Batch:
         return replace(batch, frames=replace(batch.frames, rgb=rgb), features=features)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Batch:
-        """The batch with every tensor changed, always in the same order."""
+        """The batch with every tensor replaced by `change` of it, always in the same order."""
         frames, truth = (
             type(part)(*(change(getattr(part, f.name)) for f in fields(part))) for part in (self.frames, self.truth)
         )
         features = None if self.features is None else change(self.features)
         roi = tuple(change(x) for x in self.roi)
-        return Batch(frames, change(self.queries), truth, change(self.dynamic), roi, features, self.names)
+        queries, dynamic = change(self.queries), change(self.dynamic)
+        return Batch(frames, queries, truth, dynamic, roi, features, self.names, self.iterations)
 
 
-def make_batch(clips: list[Clip], features: list[Tensor] | None = None) -> Batch:
-    """Stack clips with as many frames and tracks each.
+def make_batch(clips: list[Clip], features: list[Tensor] | None = None, iterations: int | None = None) -> Batch:
+    """Stack clips that have equally many frames and tracks.
 
     Args:
         clips: with tracks, at the model's image size.
-        features: of each clip (T, C, h, w), if they exist.
+        features: (T, C, h, w) of each clip, where they are already known.
+        iterations: M of the step; None: the tracker's own number.
     """
     video, *others = (
         torch.from_numpy(np.stack([getattr(clip, name) for clip in clips]))
@@ -124,28 +242,29 @@ def make_batch(clips: list[Clip], features: list[Tensor] | None = None) -> Batch
     tracks = [clip.tracks for clip in clips]
     queries = torch.stack([torch.from_numpy(x.queries) for x in tracks])
     xyz, visible = (torch.stack([torch.from_numpy(getattr(x, name)) for x in tracks]) for name in ("xyz", "visible"))
-    still = [np.zeros(x.queries.shape[0], bool) if x.dynamic is None else x.dynamic for x in tracks]
+    dynamic = [np.zeros(x.queries.shape[0], bool) if x.dynamic is None else x.dynamic for x in tracks]
     near, far = zip(*(quantile_roi(x) for x in frames.depths), strict=True)
     roi = tuple(torch.tensor(x).view(-1, 1, 1, 1) for x in (near, far))
     return Batch(
         frames,
         queries,
         Truth(xyz, visible, queries[..., 0].long()),
-        torch.from_numpy(np.stack(still)),
+        torch.from_numpy(np.stack(dynamic)),
         roi,
         None if features is None else torch.stack(features),
         tuple(clip.name for clip in clips),
+        iterations,
     )
 
 
 class FeatureCache:
-    """Features of whole clips by a frozen encoder, as half floats in files that are made when first asked for."""
+    """Features of whole clips by a frozen encoder, stored as float16 files that are written when first needed."""
 
     def __init__(self, folder: str | Path, encoder: Encoder, size: tuple[int, int]) -> None:
         self.folder, self.encoder, self.size = Path(folder), encoder, size
 
     def check_room(self, clips: Sequence[Path]) -> None:
-        """ValueError, with the sizes, where the disk is too small for the features of these clips."""
+        """Raise a ValueError with the sizes if the features of these clips do not fit on the disk."""
         maps = self.encoder.head.out_channels * math.prod(side // self.encoder.stride for side in self.size)
         frames = len(load_npz(clips[0], skip=("video", "tracks", "visible"))["depths"])
         missing = sum(not (self.folder / f"{clip.stem}.npy").exists() for clip in clips)
@@ -158,7 +277,7 @@ class FeatureCache:
 
     @torch.no_grad()
     def path(self, clip: Path) -> Path:
-        """The file (T, C, h, w) float16 of one clip."""
+        """The file with one clip's features (T, C, h, w) float16; encodes the clip if there is none yet."""
         path = self.folder / f"{clip.stem}.npy"
         if not path.exists():
             device = next(self.encoder.parameters()).device
@@ -169,6 +288,6 @@ class FeatureCache:
         return path
 
     def frames(self, clip: Path, index: np.ndarray) -> Tensor:
-        """Features (len(index), C, h, w) float32 of some frames."""
+        """Features (len(index), C, h, w) float32 of some frames of a clip."""
         stored = np.load(self.path(clip), mmap_mode="r")
         return torch.from_numpy(stored[index]).float()

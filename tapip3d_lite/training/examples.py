@@ -1,12 +1,12 @@
-"""`Examples`: what each step of a training looks at, made here or by other processes while the device computes.
+"""`Examples`: the input of each training step, made in this process or ahead of time by worker processes.
 
-Whatever step s draws depends on the seed and s alone. So a continued run goes where an undisturbed one would have
-gone, and it does not matter which process makes an example, or when.
+The input of step s depends on the seed and on s (and on its position in the schedule) alone. So a continued run sees
+what an uninterrupted one would have seen, whichever process makes it, and whenever.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +16,17 @@ from torch.utils.data import DataLoader, Dataset
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.simulate.dataset import leave_interrupts
 from tapip3d_lite.training.augment import augment
-from tapip3d_lite.training.config import TrainConfig
-from tapip3d_lite.training.data import Batch, FeatureCache, make_batch
-from tapip3d_lite.training.matching import Pair, draw_pair
+from tapip3d_lite.training.data import Batch, FeatureCache, draw_frames, load_part, make_batch, sample_tracks
 from tapip3d_lite.training.motion import random_coordinates
-from tapip3d_lite.training.sampling import draw_frames, load_part, sample_tracks
+from tapip3d_lite.training.pretrain import FramePair, draw_pair
+from tapip3d_lite.training.recipe import TrainConfig
 
 
 class Examples(Dataset):
-    """`examples[step]`: a list of pairs of frames in the matching stage, then batches of clips; all on the CPU."""
+    """`examples[step, position]`: pairs of frames in the matching stage, then batches of clips; all on the CPU.
+
+    The position in the schedule, from 0 to the recipe's `total`, is the step itself unless the recipe has a time budget.
+    """
 
     def __init__(
         self, config: TrainConfig, clips: Sequence[Path], rank: int = 0, cache: FeatureCache | None = None
@@ -32,30 +34,28 @@ class Examples(Dataset):
         """Draw from clips.
 
         Args:
-            config: the whole recipe.
-            clips: npz with tracks, of any image size.
+            config: the recipe.
+            clips: npz files with tracks, of any image size.
             rank: of this process among those that share the training.
-            cache: features of a frozen encoder; images are then left out of the batches.
+            cache: features of a frozen encoder; batches then have no images.
         """
         self.config, self.clips, self.rank, self.cache = config, list(clips), rank, cache
         self.size = config.tracker_config().image_size
 
-    def __len__(self) -> int:
-        return self.config.total
+    def __getitem__(self, place: tuple[int, float]) -> list[FramePair] | Batch:
+        step, position = place
+        return self.pairs(step) if position < self.config.matching_steps else self.batch(step, position)
 
-    def __getitem__(self, step: int) -> list[Pair] | Batch:
-        return self.pairs(step) if step < self.config.matching_steps else self.batch(step)
-
-    def lengths(self, step: int) -> tuple[int, int]:
-        """Frames and iterations M of a step, the same in all processes."""
+    def lengths(self, step: int, position: float) -> tuple[int, int]:
+        """Frames and updates M of a step, the same in all processes."""
         config, rng = self.config, np.random.default_rng([self.config.seed, step])
-        if step - config.matching_steps < config.short * config.steps:
+        if position - config.matching_steps < config.short * config.steps:
             return config.frames[0], config.iterations[0]
         half = config.tracker_config().window // 2
         frames = rng.choice(np.arange(config.frames[0], config.frames[1] + 1, half))
         return int(frames), int(rng.integers(config.iterations[0], config.iterations[1] + 1))
 
-    def pairs(self, step: int) -> list[Pair]:
+    def pairs(self, step: int) -> list[FramePair]:
         """This process's share of a step's pairs of frames."""
         config = self.config
         augmentation, pairs = config.augmentation if config.augment else None, []
@@ -65,15 +65,15 @@ class Examples(Dataset):
             pairs.append(draw_pair(path, rng, config.matching, self.size, augmentation))
         return pairs
 
-    def draw(self, step: int, slot: int) -> tuple[Clip, torch.Tensor | None]:
-        """The clip of one slot of a step's batch, and its features if they are kept."""
+    def draw(self, step: int, slot: int, frames: int) -> tuple[Clip, torch.Tensor | None]:
+        """The clip in one slot of a step's batch, and its features if these are stored."""
         config, rng = self.config, np.random.default_rng([self.config.seed, step, slot])
-        path, wanted = self.clips[rng.integers(len(self.clips))], self.lengths(step)[0]
+        path = self.clips[rng.integers(len(self.clips))]
         chosen = np.zeros(0, int)
 
         def choose(available: int) -> np.ndarray:
             nonlocal chosen
-            chosen = draw_frames(rng, available, wanted, config.sampling.backward)
+            chosen = draw_frames(rng, available, frames, config.sampling.backward)
             return chosen
 
         clip = load_part(path, choose, self.cache is None, self.size)
@@ -82,27 +82,25 @@ class Examples(Dataset):
         clip = random_coordinates(sample_tracks(clip, rng, config.sampling), rng, config.motion)
         return clip, None if self.cache is None else self.cache.frames(path, chosen)
 
-    def batch(self, step: int) -> Batch:
+    def batch(self, step: int, position: float) -> Batch:
         """This process's share of a step's clips."""
+        frames, iterations = self.lengths(step, position)
         slots = _share(self.rank, self.config.batch)
-        clips, features = zip(*(self.draw(step, slot) for slot in slots), strict=True)
-        return make_batch(list(clips), None if self.cache is None else list(features))
+        clips, features = zip(*(self.draw(step, slot, frames) for slot in slots), strict=True)
+        return make_batch(list(clips), None if self.cache is None else list(features), iterations)
 
-    def stream(self, first: int, workers: int = 0) -> Iterator[list[Pair] | Batch]:
-        """The examples of step `first` and the others of its stage, in order.
-
-        A stage ends the stream: what the next one is made of may depend on what this one teaches the encoder.
+    def stream(self, places: Iterable[tuple[int, float]], workers: int = 0) -> Iterator[list[FramePair] | Batch]:
+        """The examples at some places, in order.
 
         Args:
-            first: step.
-            workers: processes that make the next ones meanwhile; 0: each is made when it is asked for.
+            places: (step, position) of each; read a few steps ahead if there are workers. All of one stage, because
+                the next stage's examples depend on what this one teaches the encoder.
+            workers: processes that make examples ahead of time; 0: each is made when it is needed.
         """
-        matching = self.config.matching_steps
-        steps = range(first, matching if first < matching else len(self))
         if not workers:
-            return (self[step] for step in steps)
-        own = {"generator": torch.Generator(), "worker_init_fn": leave_interrupts}  # the caller's chance is not ours
-        return iter(DataLoader(self, None, sampler=steps, num_workers=workers, **own))
+            return (self[place] for place in places)
+        own = {"generator": torch.Generator(), "worker_init_fn": leave_interrupts}  # not the caller's generator
+        return iter(DataLoader(self, None, sampler=places, num_workers=workers, **own))
 
 
 def _share(rank: int, count: int) -> range:

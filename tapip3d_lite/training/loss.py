@@ -1,9 +1,9 @@
 """The training loss of one update, in the paper's form and in the released code's.
 
-Paper, section 3.5: L = sum_m gamma^(M - m) [ (1/d) |x - x*| + alpha BCE(v, v*) ], with d the true depth, gamma = 0.8,
-alpha = 3. The released code multiplies the distance by the focal length, so that it is an error in pixels; then the
-position term outweighs visibility about as many times as the focal length has pixels. Two options go beyond both, and
-are off unless asked for: `soften` and `within`.
+Paper, equation (4): L = sum_m gamma^(M - m) [ sum (1/d) |x - x*| + alpha BCE(v, v*) ], with d the true depth,
+gamma = 0.8, alpha = 3. The released code takes means instead of sums, and multiplies the position term by the focal
+length, so that it is an error in pixels; the weight of visibility beside position is then smaller by that factor. Ours
+always takes means, over the frames from the query on. The options `soften` and `within` are ours, and off by default.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from tapip3d_lite.model.windows import Step
 
 @dataclass(frozen=True)
 class Truth:
-    """What really happened, for a batch.
+    """The true tracks of a batch.
 
     Attributes:
-        xyz: (B, T, N, 3), world.
+        xyz: (B, T, N, 3) positions, world.
         visible: (B, T, N) bool.
-        times: (B, N) int64 query frames; only frames from there on are scored.
+        times: (B, N) int64, frames of the queries; only frames from there on count.
     """
 
     xyz: Tensor
@@ -38,18 +38,18 @@ class LossConfig:
     """Weights of the loss.
 
     Attributes:
-        form: `"paper"`: distances divided by depth; `"pixels"`: that times sqrt(fx fy), as released.
-        visibility: alpha, weight of the visibility term beside the position term.
-        discount: gamma, weight of an update relative to the one after it.
-        scale: multiplies everything.
-        soften: c pixels, or 0 for the plain distance. An error of e pixels counts as c log(1 + e / c): the scores count
-            thresholds that double (1, 2, ... 16 pixels), so they measure the logarithm of an error, too.
-        within: pixels, or 0. A point is taught as visible only where this update puts it that near to the truth, so
-            that "visible" means "seen and trusted": a point called visible in a wrong place costs AJ twice. TAPIR and
-            CoTracker3 learn such a confidence beside the visibility.
+        form: `"paper"`: distances divided by depth; `"pixels"`: that times sqrt(fx fy), as in the released code.
+        visibility: alpha, weight of the visibility term relative to the position term.
+        discount: gamma, weight of an update relative to the update after it.
+        scale: factor of the whole loss.
+        soften: c in pixels, or 0 for the plain distance. An error of e pixels counts as c log(1 + e / c). The metrics
+            count errors below 1, 2, 4, 8 and 16 pixels, which is logarithmic in the error as well.
+        within: pixels, or 0. The target of visibility is true only where this update's position error is smaller than
+            that, so that "visible" means "visible and well located": AJ counts a visible point in a wrong place twice.
+            TAPIR and CoTracker3 learn such a confidence separately from visibility.
 
     Raises:
-        ValueError: an unknown form or a weight that cannot be.
+        ValueError: an unknown form, or a weight outside its range.
     """
 
     form: str = "pixels"
@@ -78,8 +78,8 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
         config: weights.
 
     Returns:
-        Two scalars whose sum is to be minimised. Frames before the query, padded frames (repeats of the last one) and
-        tracks that only fill up the batch do not count.
+        Two scalars whose sum is minimised. Frames before the query, padded frames (repetitions of the last one) and
+        inactive tracks, which only fill up the batch, do not count.
     """
     frames = step.scene.frames
     index = torch.arange(step.start, step.start + len(frames), device=step.coords.device)
@@ -97,7 +97,7 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
         error = error / focal
     entropy = F.binary_cross_entropy_with_logits(step.logits, visible.to(step.logits.dtype), reduction="none")
     weight = config.scale * config.discount ** (iterations - 1 - step.iteration)
-    # A mean over each clip, then over clips: so the mean over processes is the mean over their joint batch.
+    # A mean over each clip, then over clips: so the mean over processes is the mean over all their clips.
     position, visibility = (
         ((x * counted).flatten(1).sum(1) / counted.flatten(1).sum(1).clamp(min=1)).mean() for x in (error, entropy)
     )

@@ -1,8 +1,8 @@
-"""Random rigid motions of the coordinates, which make one checkpoint serve camera and world space.
+"""Random rigid motions of the coordinates, so that one checkpoint serves camera and world space.
 
-Paper: appendix (training): "everything is moved to the camera frame, then moved by a smoothly varying random rigid
-motion". Between two frames of real camera space the scene moves rigidly as the camera does; a tracker that has seen
-all kinds of such motion, none included, does not care in which frame of reference it is told its points.
+Paper: appendix (training). Everything is moved to the camera frame, then by a smoothly varying random rigid motion. In
+camera space the whole scene moves rigidly from frame to frame, opposite to the camera; a tracker that was trained with
+all such motions, none included, works in either space. Ours also leaves a share of the examples in the world.
 """
 
 from __future__ import annotations
@@ -18,15 +18,18 @@ from tapip3d_lite.geometry import invert, transform
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """How often and how coordinates are moved; lengths are scene units.
+    """How often and how far coordinates are moved; lengths are in scene units.
 
     Attributes:
-        world: share of the examples that stay in the world.
-        turned: share that are turned as a whole into random axes; the others are moved to the camera frame.
-        still: share of those in the camera frame that get no further motion.
-        velocity, velocity_noise: greatest speed of the motion and standard deviation of its changes, per frame.
-        rotation, rotation_noise: the same for the angle, radians per frame.
-        smoothing: of the changes, 0 (none) to 1.
+        world: share of the examples that stay in the world frame.
+        turned: share of the examples in a randomly rotated world frame; all others are moved to the camera frame.
+        still: share of the examples in the camera frame without further motion.
+        velocity, velocity_noise: greatest initial speed, and standard deviation of its changes, per frame.
+        rotation, rotation_noise: the same for the rotation, in radians per frame.
+        smoothing: of the changes over time, from 0 (none) to 1.
+
+    Raises:
+        ValueError: a share outside [0, 1], or a negative velocity or rotation.
     """
 
     world: float = 0.7
@@ -47,7 +50,7 @@ class MotionConfig:
 
 
 def smooth_motion(rng: np.random.Generator, frames: int, config: MotionConfig) -> np.ndarray:
-    """A random rigid motion (T, 4, 4) that starts at the identity and whose velocity changes smoothly."""
+    """Draw a rigid motion (T, 4, 4) that starts at the identity and whose velocity changes smoothly."""
     limits = np.array([config.velocity, config.rotation])[:, None]
     noise = np.array([config.velocity_noise, config.rotation_noise])[:, None]
     speed = _directions(rng) * rng.uniform(0, 1, (2, 1)) * limits  # (translation, rotation) per frame
@@ -62,14 +65,14 @@ def smooth_motion(rng: np.random.Generator, frames: int, config: MotionConfig) -
 
 
 def move(clip: Clip, motion: np.ndarray) -> Clip:
-    """The same clip told in other coordinates: a point at x in frame t is now at motion[t] x.
+    """Express a clip in other coordinates: a point at x in frame t is then at motion[t] x.
 
     Args:
         clip: T frames.
-        motion: (T, 4, 4) rigid.
+        motion: (T, 4, 4), rigid.
 
     Returns:
-        The clip with other extrinsics, queries and tracks; what cameras see stays the same.
+        The clip with other extrinsics, queries and tracks, which project to the same pixels as before.
     """
     motion = np.asarray(motion, np.float64)
     extrinsics = clip.extrinsics.astype(np.float64) @ invert(motion)
@@ -81,7 +84,7 @@ def move(clip: Clip, motion: np.ndarray) -> Clip:
 
 
 def random_coordinates(clip: Clip, rng: np.random.Generator, config: MotionConfig) -> Clip:
-    """Leave a clip in its world, turn it as a whole, or move it to the camera frame and shake it smoothly."""
+    """Leave a clip in its world frame, rotate that frame, or move everything to the camera frame and then smoothly on."""
     kind = rng.random()
     if kind < config.world:
         return clip
@@ -109,7 +112,7 @@ def _directions(rng: np.random.Generator) -> np.ndarray:
 
 
 def _random_rotation(rng: np.random.Generator) -> np.ndarray:
-    """Uniform over all rotations: the orthogonal factor of a normal matrix, made proper."""
+    """A rotation drawn uniformly: the orthogonal factor of a matrix of normal numbers, with determinant 1."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q if np.linalg.det(q) > 0 else -q

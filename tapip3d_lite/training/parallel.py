@@ -1,28 +1,11 @@
-"""Several processes, one training: gradients are averaged by torch's DistributedDataParallel.
-
-The memory-saving backward runs many small backward passes a step, and DDP wants to average once. So those passes
-only collect gradients; then a pass through a sum that is zero makes DDP average what has been collected, which is
-how it accumulates gradients over several passes (`no_sync`).
-"""
+"""Several processes, one training: each computes gradients of its own clips, and all step with their mean."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
-from torch import Tensor, distributed, nn
-from torch.nn.parallel import DistributedDataParallel
-
-
-class _Touch(nn.Module):
-    """A zero that depends on every parameter."""
-
-    def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
-        super().__init__()
-        self.shared = nn.ParameterList(parameters)
-
-    def forward(self) -> Tensor:
-        return sum(p.sum() * 0 for p in self.shared)
+from torch import distributed, nn
 
 
 class Group:
@@ -33,35 +16,40 @@ class Group:
         size: number of processes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device | str = "cpu") -> None:
         active = distributed.is_available() and distributed.is_initialized()
         self.rank, self.size = (distributed.get_rank(), distributed.get_world_size()) if active else (0, 1)
-        self._touch: nn.Module | None = None
+        self._device = device
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this process writes files and shows the bar."""
         return self.rank == 0
 
-    def share(self, parameters: Sequence[nn.Parameter]) -> None:
-        """Give all processes the first one's parameters, whose gradients `average` will average from now on."""
+    @torch.no_grad()
+    def copy_from_main(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Overwrite parameters by those of the main process."""
         if self.size > 1:
-            self._touch = DistributedDataParallel(_Touch(parameters))
+            for parameter in parameters:
+                distributed.broadcast(parameter, 0)
 
     def average(self, parameters: Sequence[nn.Parameter]) -> None:
-        """Replace gradients by their mean over processes."""
-        if self._touch is None:
+        """Replace gradients by their mean over processes, in place."""
+        if self.size == 1:
             return
         for parameter in parameters:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
-        self._touch().backward()
+        gradients = [parameter.grad for parameter in parameters]
+        flat = torch.cat([gradient.flatten() for gradient in gradients]) / self.size
+        distributed.all_reduce(flat)
+        for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+            gradient.copy_(part.view_as(gradient))
 
-    def any(self, flag: bool) -> bool:
-        """Whether the flag is true in any process."""
-        if self._touch is None:
-            return flag
-        parameter = next(self._touch.parameters())
-        told = torch.tensor([float(flag)], device=parameter.device)
-        distributed.all_reduce(told)
-        return bool(told.item())
+    def sum(self, value: float) -> float:
+        """The sum of a number over processes."""
+        if self.size == 1:
+            return value
+        total = torch.tensor(value, dtype=torch.float64, device=self._device)
+        distributed.all_reduce(total)
+        return total.item()

@@ -1,7 +1,7 @@
 """Augmentations that change where things are in the image: pad, resize and crop; mirror; play backward.
 
-Paper: appendix (training). Each changes pixels, cameras and truth together, so that a visible point still projects to
-where colour and depth show it.
+Paper: appendix (training). Each changes pixels, cameras and true tracks together, so that a visible point still projects
+to the pixel that shows it.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ _MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0]).astype(np.float32)
 
 
 def requery(tracks: Tracks) -> Tracks:
-    """Ask for points where they are seen: at their own query frame, else at the first that shows them, else drop them.
+    """Keep a query whose point is visible in its frame, move others to the first visible frame, drop hidden points.
 
     Args:
-        tracks: true tracks, whose visibility may have been reduced.
+        tracks: true tracks, after their visibility was changed.
     """
     kept = tracks.select(tracks.visible.any(0))
     queries, columns = kept.queries.copy(), np.arange(kept.xyz.shape[1])
@@ -33,9 +33,9 @@ def requery(tracks: Tracks) -> Tracks:
 
 
 def with_visibility(clip: Clip, visible: np.ndarray | None, **changes: object) -> Clip:
-    """A changed clip whose points are seen only where `visible` (T, N), asked for anew where they must be.
+    """Change a clip and the visibility (T, N) of its points, and move or drop queries accordingly.
 
-    Queries of a clip without tracks are dropped, because nobody knows which of them are still seen.
+    Queries of a clip without tracks are dropped, since it is unknown which of them are still visible.
     """
     tracks = None if clip.tracks is None else requery(replace(clip.tracks, visible=visible))
     return replace(clip, **changes, tracks=tracks, queries=None if tracks is None else tracks.queries)
@@ -44,17 +44,17 @@ def with_visibility(clip: Clip, visible: np.ndarray | None, **changes: object) -
 def random_view(
     clip: Clip, rng: np.random.Generator, pad: float, scale: tuple[float, float], drift: float
 ) -> tuple[float, np.ndarray]:
-    """Draw padding, a scale and a crop of the original size that wanders over the frames, as one map of pixels.
+    """Draw padding, a scale and a moving crop of the original size, combined to one map of pixels.
 
     Args:
         clip: T frames.
-        rng: source of chance.
-        pad: greatest black border on each side.
-        scale: (smallest, greatest) factor of size.
-        drift: greatest change of the crop's place from frame to frame. Lengths are fractions of the image's width.
+        rng: random generator.
+        pad: greatest black border of each side, a fraction of the image's width.
+        scale: (smallest, greatest) factor of the resizing.
+        drift: greatest change of the crop's position from one frame to the next, a fraction of the image's width.
 
     Returns:
-        The factor s and offsets (T, 2), for `reframe`.
+        The scale s and offsets (T, 2) in pixels, for `reframe`.
     """
     size = np.array(clip.size[::-1], float)
     before, after = rng.uniform(0, pad * size[0], (2, 2))
@@ -70,15 +70,15 @@ def random_view(
 
 
 def reframe(clip: Clip, scale: float, offsets: np.ndarray) -> Clip:
-    """Look at a clip through another window of the same size: u' = scale u - offset.
+    """Resize and crop a clip to its old size: u' = scale u - offset.
 
-    Inverse depth is linear in the image on any plane, so it is what is interpolated, and only within one surface;
-    across an edge the nearest pixel's depth is taken, so that no surface appears between two.
+    Depth is interpolated as inverse depth, which is linear in the image on any plane, and only within one surface;
+    at an edge between two surfaces the nearest pixel's depth is taken, so that no third surface appears between them.
 
     Args:
         clip: T frames.
-        scale: factor of size.
-        offsets: (T, 2), pixels of the result.
+        scale: factor of the resizing.
+        offsets: (T, 2) in pixels of the result.
 
     Raises:
         ValueError: a factor that is not positive, offsets of another shape, or a view without any valid depth.
@@ -106,19 +106,19 @@ def reframe(clip: Clip, scale: float, offsets: np.ndarray) -> Clip:
 def flip_x(clip: Clip) -> Clip:
     """Mirror left and right.
 
-    No rigid camera sees a world mirrored, so the world is mirrored too, always in its x axis: poses stay rigid, "up"
-    stays up in worlds whose x is level, and `flip_x` with `flip_y` leaves the world as it was.
+    The world is mirrored too, in its x axis, because no rigid camera pose can mirror an image. So poses stay rigid, "up"
+    stays up in worlds with a horizontal x axis, and `flip_x` followed by `flip_y` leaves the world as it was.
     """
     return _flip(clip, 0)
 
 
 def flip_y(clip: Clip) -> Clip:
-    """Turn upside down by mirroring; the world is mirrored in its x axis as by `flip_x`."""
+    """Mirror top and bottom; the world is mirrored in its x axis, as in `flip_x`."""
     return _flip(clip, 1)
 
 
 def flip_time(clip: Clip) -> Clip:
-    """Play backward; every point keeps the frame in which it is asked for."""
+    """Play backward; each query stays in the same image."""
     last, tracks, queries = len(clip) - 1, clip.tracks, clip.queries
     if queries is not None:
         queries = queries * np.array([-1, 1, 1, 1], np.float32) + np.array([last, 0, 0, 0], np.float32)
@@ -132,7 +132,7 @@ def flip_time(clip: Clip) -> Clip:
 
 
 def _flip(clip: Clip, axis: int) -> Clip:
-    """Mirror pixels in one axis (0: u, 1: v), cameras and world to fit."""
+    """Mirror pixels along one axis (0: u, 1: v), and cameras and world accordingly."""
     seen, intrinsics = np.eye(4, dtype=np.float32), clip.intrinsics.copy()
     seen[axis, axis] = -1
     intrinsics[:, axis, 2] = clip.size[1 - axis] - 1 - intrinsics[:, axis, 2]

@@ -1,7 +1,8 @@
-"""`Trainer`: one training in one folder, which can be stopped at any moment and continued exactly.
+"""`Trainer`: one training in one folder, which can be stopped at any step and continued exactly.
 
-Paper: section 4 and appendix (AdamW, one cycle, clipping, memory-saving backward). First the encoder learns to match
-(`matching`), then the tracker learns to track. Several processes (torchrun) share the work through DDP.
+Paper: section 4 and appendix (AdamW, one cycle, gradient clipping, backward in constant memory). The first stage
+pretrains the encoder by matching (`pretrain`, ours), the second trains the tracker. Several processes (torchrun) share
+the work: each step uses the mean of their gradients.
 """
 
 from __future__ import annotations
@@ -15,32 +16,34 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.clip import Clip
+from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.registry import load_part
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.model.weights import save_weights
+from tapip3d_lite.model.weights import load_weights, save_weights
+from tapip3d_lite.training.accuracy import Accuracy
 from tapip3d_lite.training.backward import add_gradients, losses
-from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.data import Batch, FeatureCache
 from tapip3d_lite.training.examples import Examples
-from tapip3d_lite.training.journal import Journal
-from tapip3d_lite.training.matching import Pair, matching_loss
+from tapip3d_lite.training.optimizer import adamw, set_rate
 from tapip3d_lite.training.parallel import Group
-from tapip3d_lite.training.scores import Accuracy, validate
-from tapip3d_lite.training.start import begin_with
+from tapip3d_lite.training.pretrain import FramePair, matching_loss
+from tapip3d_lite.training.recipe import TrainConfig
+from tapip3d_lite.training.run_folder import Bar, RunFolder
+from tapip3d_lite.training.schedule import Schedule
 
 
 class Trainer:
     """Trains a tracker in a folder.
 
-    The folder holds `config.json`, `log.jsonl` (one line a step), `checkpoint.pt`, `features/` of the frozen encoder
-    (on a CPU; a GPU encodes anew sooner), and at the end `weights.safetensors`.
+    The folder holds `config.json`, `log.jsonl` (one line a step), `checkpoint.pt`, `features/` of a frozen encoder (only
+    on a CPU; a GPU encodes faster than it reads), and at the end `weights.safetensors`.
 
     Attributes:
         tracker: what is trained.
-        examples: what it is trained on, by step.
-        step: steps done, of both stages together.
+        examples: its input, by step.
+        step: number of steps done, of both stages together.
+        schedule: how far the training has come.
         recorded: on a GPU, record steps as CUDA graphs.
     """
 
@@ -51,58 +54,57 @@ class Trainer:
         folder: str | Path,
         config: TrainConfig,
         clips: Sequence[Path],
-        validation: Sequence[Clip] = (),
+        validate: Callable[[Tracker], dict[str, float]] | None = None,
         device: str = "cpu",
         resume: bool = False,
         workers: int = 0,
         compiled: bool = False,
     ) -> None:
-        """Start a training, or take it up again.
+        """Start a training, or continue one.
 
         Args:
-            folder: made if missing.
-            config: the whole recipe.
-            clips: training clips (npz with tracks) of any image size.
-            validation: held-out clips.
+            folder: of the training; made if missing.
+            config: the recipe.
+            clips: training clips (npz files with tracks) of any image size.
+            validate: scores the tracker every `config.evaluate_every` steps; the scores are added to the log.
+                `lab.held_out_scores` makes such a function.
             device: `"cpu"` or `"cuda"`.
             resume: continue from the folder's checkpoint, if there is one.
-            workers: processes that make examples while this one trains, for a GPU that would wait for them.
-            compiled: let torch compile the tracker's parts: minutes at first, then each step takes a fraction (GPU).
+            workers: processes that make examples ahead of time; for a GPU, which would otherwise wait for them.
+            compiled: compile the tracker's parts, which takes minutes and then makes each step faster (GPU).
 
         Raises:
-            ValueError: no clips; the folder holds a training already (without `resume`) or one of another recipe; no room.
+            ValueError: no clips; the folder holds a training already (without `resume`) or one of another recipe; no
+                room for features; weights of other sizes to start from.
         """
         if workers < 0:
             raise ValueError(f"Trainer: workers must not be negative, got {workers}; 0 makes examples in this process")
         if not clips:
             raise ValueError("Trainer: no training clips; make some with `training_clips` or `simulate`")
-        self.config, self.validation, self.device, self.workers = config, list(validation), device, workers
-        self.journal = Journal(folder, config, resume)
-        with torch.random.fork_rng():  # the caller's chance is not ours
+        self.config, self.validate, self.device, self.workers = config, validate, device, workers
+        self.folder = RunFolder(folder, config, resume)
+        with torch.random.fork_rng():  # leaves the caller's random generator as it is
             torch.manual_seed(config.seed)
             self.tracker = Tracker(config.tracker_config()).to(device).train()
             nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
         if config.init is not None:
-            begin_with(self.tracker, config.init)
-        self.group, self.step, self.seconds = Group(), 0, 0.0
+            _start_from(self.tracker, config.init)
+        self.group, self.step, self.seconds = Group(device), 0, 0.0
         self._on_gpu, cache = torch.device(device).type == "cuda", None
         if not config.train_encoder and not self._on_gpu:
             size = self.tracker.config.image_size
-            cache = FeatureCache(self.journal.folder / "features", self.tracker.encoder, size)
+            cache = FeatureCache(self.folder.path / "features", self.tracker.encoder, size)
             cache.check_room(clips)
         self.examples = Examples(config, clips, self.group.rank, cache)
-        saved = self.journal.checkpoint(device)
+        saved = self.folder.checkpoint(device)
         if saved is not None:
             self.tracker.load_state_dict(saved["model"])
             self.step, self.seconds = saved["step"], saved["seconds"]
+        self.schedule = Schedule(config, self.group, 0 if saved is None else saved["position"])
+        self.group.copy_from_main(self.tracker.parameters())
         if compiled:
             _compile(self.tracker)
         self._enter_stage(saved)
-
-    @property
-    def matching(self) -> bool:
-        """Whether the encoder is being taught to match."""
-        return self.step < self.config.matching_steps
 
     def run(
         self,
@@ -113,7 +115,7 @@ class Trainer:
         """Train until the end, or until `stop()` is true after a step; either way everything is saved.
 
         Args:
-            stop: asked after every step, e.g. by a button.
+            stop: called after every step.
             watch: called with every line of the log, e.g. by a live plot.
             progress: show a bar with loss, accuracy, speed and remaining time.
 
@@ -123,73 +125,69 @@ class Trainer:
         Raises:
             FloatingPointError: the loss or a gradient is not finite; the batch is saved in the folder.
         """
-        with self.journal.bar(self.step, self.config.total, progress and self.group.leads) as bar:
+        with Bar.open(self.schedule.position, self.config.total, progress and self.group.is_main) as bar:
             for line in self.steps(stop):
-                bar.show(line)
+                bar.show(line, self.schedule.position)
                 watch(line)
-        return self.step == self.config.total
+        return self.schedule.finished
 
     def steps(self, stop: Callable[[], bool] = lambda: False) -> Iterator[dict]:
-        """As `run`, one step at a time, for a caller with something else to do between two: yields lines of the log.
+        """Train like `run`, and yield each step's line of the log, so that the caller can do something between steps.
 
         Args:
-            stop: asked when the caller comes back from a step; what there is then is saved.
+            stop: called when the caller asks for the next step; if true, everything is saved instead.
 
         Raises:
-            FloatingPointError: see `run`.
+            FloatingPointError: the loss or a gradient is not finite; the batch is saved in the folder.
         """
+        self.schedule.start_clock()
         halted = False
-        while self.step < self.config.total and not halted:
+        while not self.schedule.finished and not halted:
             yield self._one_step()
-            halted = self.group.any(stop())
-            if halted or self.step == self.config.total or self.step % self.config.save_every == 0:
+            halted = self.group.sum(stop()) > 0
+            if halted or self.schedule.finished or self.step % self.config.save_every == 0:
                 self.save()
-        if self.step == self.config.total and self.group.leads:
-            self._finish()
+        if self.schedule.finished and self.group.is_main:
+            save_weights(self.tracker, self.folder.path / "weights.safetensors", half=True)
 
     def save(self) -> None:
-        """Write the checkpoint (atomically)."""
-        if self.group.leads:
-            state = {
-                "model": self.tracker.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-                "schedule": self.schedule.state_dict(),
-                "step": self.step,
-                "seconds": self.seconds,
-            }
-            self.journal.save(state)
+        """Write the checkpoint atomically."""
+        if self.group.is_main:
+            state = {"model": self.tracker.state_dict(), "optimizer": self.optimizer.state_dict()}
+            self.folder.save(state | {"step": self.step, "position": self.schedule.position, "seconds": self.seconds})
 
-    def example(self) -> list[Pair] | Batch:
-        """What the next step looks at."""
+    def example(self) -> list[FramePair] | Batch:
+        """The input of the next step."""
         if self._coming is None:
-            self._coming = self.examples.stream(self.step, self.workers)
+            self._coming = self.examples.stream(self.schedule.places(self.step), self.workers)
         return next(self._coming)
 
     def _one_step(self) -> dict:
-        started = time.perf_counter()
+        started, before, matching = time.perf_counter(), self.schedule.position, self.schedule.matching
         self.optimizer.zero_grad()
-        line = {"step": self.step + 1, "stage": "matching" if self.matching else "tracking"}
+        line = {"step": self.step + 1, "stage": "matching" if matching else "tracking"}
         example = self.example()
-        line |= self._match(example) if self.matching else self._track(example)
+        line |= self._match(example) if matching else self._track(example)
         self.group.average(self.parameters)
-        norm = float(nn.utils.clip_grad_norm_(self.parameters, self._clip_norm))
+        norm = float(nn.utils.clip_grad_norm_(self.parameters, self.schedule.recipe.clip_norm))
         if not np.isfinite([line["loss"], norm]).all():
-            raise FloatingPointError(self.journal.refuse(line, norm, self._drawn))
-        line |= {"norm": norm, "lr": self.schedule.get_last_lr()[0]}
+            raise FloatingPointError(self.folder.save_failure(line, norm, self._drawn))
+        rate = self.schedule.rate()
+        set_rate(self.optimizer, *rate)
         self.optimizer.step()
-        self.schedule.step()
         self.step += 1
         self.seconds += time.perf_counter() - started
-        line["seconds"] = self.seconds
-        if self.step == self.config.matching_steps:
+        line |= {"norm": norm, "lr": rate[0], "seconds": self.seconds}
+        self.schedule.advance(self.step)
+        if matching and not self.schedule.matching:
             self._enter_stage(None)
-        elif self.validation and not self.matching and self._due():
-            line |= validate(self.tracker, self.validation)
-        if self.group.leads:
-            self.journal.write(line)
+        elif self.validate and not matching and self.schedule.due(before):
+            line |= self._scores()
+        if self.group.is_main:
+            self.folder.write(line)
         return line
 
-    def _match(self, pairs: list[Pair]) -> dict:
+    def _match(self, pairs: list[FramePair]) -> dict:
         self._drawn = {"rgb": [pair.rgb for pair in pairs], "uv": [pair.uv for pair in pairs]}
         pairs = [pair.to(self.device) for pair in pairs]
         with self._precision():
@@ -198,10 +196,10 @@ class Trainer:
         return {"loss": float(loss.detach()), "right": float(right)}
 
     def _track(self, batch: Batch) -> dict:
-        batch, iterations = batch.to(self.device), self.examples.lengths(self.step)[1]
+        batch = batch.to(self.device)
         self._drawn = {"names": batch.names, "queries": batch.queries, "truth": vars(batch.truth)}
         run = self._add_gradients if self._replay is None else self._replay
-        parts, seen = run(batch, iterations)
+        parts, seen = run(batch, batch.iterations)
         return losses(parts) | Accuracy.result(seen)
 
     def _add_gradients(self, batch: Batch, iterations: int) -> tuple[Tensor, Tensor]:
@@ -217,36 +215,37 @@ class Trainer:
         return torch.autocast(self.device, torch.bfloat16, enabled=self.config.precision == "bfloat16")
 
     def _enter_stage(self, saved: dict | None) -> None:
-        """Choose what is trained, and make its optimiser."""
+        """Choose the parameters of a stage, and make their optimiser, or load a saved one."""
         self._coming = None
-        config, encoder = self.config, self.tracker.encoder
-        self.tracker.requires_grad_(not self.matching)
-        encoder.requires_grad_(self.matching or config.train_encoder)
+        matching, recipe = self.schedule.matching, self.schedule.recipe
+        self.tracker.requires_grad_(not matching)
+        self.tracker.encoder.requires_grad_(matching or self.config.train_encoder)
         self.parameters = [p for p in self.tracker.parameters() if p.requires_grad]
-        self.group.share(self.parameters)
-        recipe = config.matching if self.matching else config
-        self._clip_norm = recipe.clip_norm
-        record = self.recorded and self._on_gpu
-        step = load_part("tapip3d_lite.speed.cuda_graph:CudaGraphStep") if record else None
-        self._replay = step(self._add_gradients, self.parameters) if record else None
-        plain = [p for p in self.parameters if p.ndim < 2]  # biases and norms are not decayed
-        decayed = [p for p in self.parameters if p.ndim >= 2]
-        groups = [{"params": decayed, "weight_decay": recipe.weight_decay}, {"params": plain, "weight_decay": 0.0}]
-        steps = config.matching_steps if self.matching else config.steps
-        self.optimizer = torch.optim.AdamW(groups, recipe.lr, fused=self._on_gpu or None)
-        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self.optimizer, recipe.lr, total_steps=steps + 1, pct_start=config.warmup
-        )
-        if saved is not None and len(saved["optimizer"]["param_groups"]) == 2:
+        self._replay = None
+        if self.recorded and self._on_gpu:
+            self._replay = load_part("tapip3d_lite.speed.cuda_graph:CudaGraphStep")(
+                self._add_gradients, self.parameters
+            )
+        self.optimizer = adamw(self.parameters, recipe.lr, recipe.weight_decay, fused=self._on_gpu)
+        if saved is not None:
             self.optimizer.load_state_dict(saved["optimizer"])
-            self.schedule.load_state_dict(saved["schedule"])
 
-    def _due(self) -> bool:
-        done = self.step - self.config.matching_steps
-        return done % self.config.evaluate_every == 0 or self.step == self.config.total
+    def _scores(self) -> dict[str, float]:
+        self.tracker.eval()
+        with torch.compiler.set_stance("force_eager"):  # held-out clips have other shapes than parts are compiled for
+            scores = self.validate(self.tracker)
+        self.tracker.train()
+        return scores
 
-    def _finish(self) -> None:
-        save_weights(self.tracker, self.journal.folder / "weights.safetensors", half=True)
+
+def _start_from(tracker: Tracker, name: str) -> None:
+    """Load weights, `"lite"` or a file, into a tracker; other sizes raise a ValueError that names one of them."""
+    try:
+        tracker.load_state_dict(load_weights(shipped_weights().get(name, name)).state_dict())
+    except RuntimeError as error:
+        raise ValueError(
+            f"TrainConfig.init: {name!r} belongs to a tracker of other sizes: {str(error).splitlines()[-1].strip()}"
+        ) from error
 
 
 def _compile(tracker: Tracker) -> None:
@@ -254,7 +253,7 @@ def _compile(tracker: Tracker) -> None:
     from torch._functorch import config as functorch
 
     dynamo.recompile_limit = 64  # levels differ in size
-    functorch.donated_buffer = False  # the queries' neighbourhoods are walked backward once for each window
+    functorch.donated_buffer = False  # the queries' neighbourhoods are backpropagated once for each window
     parts = [tracker.encoder, tracker.neighborhood, tracker.context]
     parts += [part for part in tracker.updater.modules() if isinstance(part, Block)]  # alike, so compiled once for all
     for part in parts:

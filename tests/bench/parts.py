@@ -29,9 +29,9 @@ from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.simulate import simulate_clip
 from tapip3d_lite.speed.box_knn import BlockTree
 from tapip3d_lite.training.backward import plain_backward, saving_backward
-from tapip3d_lite.training.config import TrainConfig
 from tapip3d_lite.training.data import training_clips
 from tapip3d_lite.training.loss import LossConfig, Truth
+from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.trainer import Trainer
 from tests.bench.report import Row, compared
 from tests.bench.timing import extra_memory, own_clock, side_by_side, stages

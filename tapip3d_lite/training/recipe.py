@@ -1,4 +1,4 @@
-"""`TrainConfig`: a whole training as one value; with the clips' seeds it determines the weights on one machine."""
+"""`TrainConfig`: all settings of a training; together with the clips they determine the weights on one machine."""
 
 from __future__ import annotations
 
@@ -7,40 +7,45 @@ from typing import Any
 
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.training.augment import AugmentConfig
+from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.loss import LossConfig
-from tapip3d_lite.training.matching import MatchingConfig
 from tapip3d_lite.training.motion import MotionConfig
-from tapip3d_lite.training.sampling import SamplingConfig
+from tapip3d_lite.training.pretrain import MatchingConfig
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """What is trained, on what, and how long. Defaults are the `lite` recipe for two CPU cores; see also `recipe`.
+    """What is trained, on what, and how long. The defaults are the `lite` recipe for two CPU cores; see `recipe`.
 
     Attributes:
         preset: of the tracker, `"lite"` or `"paper"`.
         tracker: fields of the preset to set differently, e.g. `{"context": "p2n"}`; `--tracker context p2n`.
-        init: weights to start from instead of chance, `"lite"` or a file; usually with `matching_steps=0`.
-        clips: number of training clips; the kept features of one take 13 MB.
-        matching_steps: steps that teach the encoder alone to match; 0 leaves it random.
-        steps: steps that train the tracker.
-        batch: clips a step (of each process).
-        frames: (fewest, most) frames of an example; drawn for each step, in steps of half a window.
+        init: weights to start from, `"lite"` or a file, instead of a random initialisation; usually with
+            `matching_steps=0`.
+        clips: number of training clips; the stored features of one take 13 MB.
+        matching_steps: steps of the first stage, which pretrains the encoder; 0 keeps it as initialised.
+        steps: steps of the second stage, which trains the tracker.
+        minutes: time budget for both stages; None: none. With a budget the training ends when the time does, however
+            many steps that makes; `matching_steps`, `steps`, `short`, `warmup` and `evaluate_every` then count equal
+            parts of the time, `matching_steps + steps` in all, so that learning rate and stages follow the clock.
+        batch: number of clips in a step (of each process).
+        frames: (fewest, most) frames of an example; drawn for each step, in multiples of half a window.
         iterations: (fewest, most) updates of a window; drawn for each step. One number stands for both.
-        short: share of the steps, the first ones, that take the fewest of both: what is near zero motion is learned
-            first, then to start from estimates that are nearly right, as later updates and windows do.
-        train_encoder: train the encoder along; otherwise its features are kept in files, and a step costs half.
-        lr, weight_decay, warmup, clip_norm: AdamW with one cosine cycle (the paper's: 5e-4, 5e-4, 0.05, 10).
+        short: share of the steps, at the start, with the fewest frames and updates: they teach to leave zero motion;
+            later steps teach to continue from good estimates, as later updates and windows must.
+        train_encoder: train the encoder too; otherwise its features are stored in files, and a step costs half.
+        lr, weight_decay, warmup, clip_norm: of AdamW with one cosine cycle (paper: 5e-4, 5e-4, 0.05, 10).
         precision: `"float32"`, or `"bfloat16"` for autocast.
-        head: standard deviation of the output layer's first weights.
-        seed: of everything that is drawn.
-        evaluate_every, validation: steps between evaluations, and on how many held-out clips.
+        head: standard deviation of the output layer's initial weights.
+        seed: of the random generators.
+        evaluate_every: steps between evaluations on held-out clips.
+        validation: number of held-out clips.
         save_every: steps between checkpoints.
-        augment: change the images of both stages as `augmentation` says, each time anew; the encoder must then be
-            trained along, since kept features would not follow.
+        augment: apply `augmentation` to the images of both stages; needs `train_encoder`, since stored features cannot
+            follow changed images.
 
     Raises:
-        ValueError: a value that cannot work.
+        ValueError: a value outside its range, or values that exclude one another.
     """
 
     preset: str = "lite"
@@ -49,6 +54,7 @@ class TrainConfig:
     clips: int = 1000
     matching_steps: int = 2500
     steps: int = 6000
+    minutes: float | None = None
     batch: int = 1
     frames: tuple[int, int] = (8, 16)
     iterations: tuple[int, int] = (2, 3)
@@ -82,13 +88,15 @@ class TrainConfig:
                 raise ValueError(f"TrainConfig.{name}: expected at least 1, got {getattr(self, name)}")
         if self.matching_steps < 0 or self.validation < 0:
             raise ValueError("TrainConfig: matching_steps and validation must not be negative")
+        if self.minutes is not None and self.minutes <= 0:
+            raise ValueError(f"TrainConfig.minutes: expected a positive time or None, got {self.minutes}")
         if self.precision not in ("float32", "bfloat16"):
             raise ValueError(f'TrainConfig.precision: expected "float32" or "bfloat16", got {self.precision!r}')
         if self.lr <= 0 or not 0 < self.warmup < 1 or not 0 <= self.short <= 1:
             raise ValueError("TrainConfig: lr must be positive, warmup in (0, 1), short in [0, 1]")
         if self.augment and not self.train_encoder:
             raise ValueError(
-                "TrainConfig.augment: features of a frozen encoder are kept in files and cannot follow changed images; "
+                "TrainConfig.augment: features of a frozen encoder are stored in files and cannot follow changed images; "
                 "set train_encoder=True, or augment=False"
             )
         half = self.tracker_config().window // 2
@@ -99,8 +107,8 @@ class TrainConfig:
     def recipe(cls, preset: str = "lite", **changes: Any) -> TrainConfig:
         """The recipe of a preset: `"lite"` (the defaults), or `"paper"`.
 
-        Paper: section 4 and appendix; meant for 8 processes with a GPU each. Batches, clips and the visibility weight
-        are the paper's; instead of CoTracker3's encoder it starts from our matching stage, and its clips are simulated.
+        Paper: section 4 and appendix; 8 processes with a GPU each. Optimiser, schedule, batches, loss and augmentation
+        are the paper's; ours are the simulated clips, and the pretraining in place of CoTracker3's encoder.
 
         Args:
             preset: `"lite"` or `"paper"`.
@@ -125,12 +133,12 @@ class TrainConfig:
         return cls(**({"preset": preset} | (paper if preset == "paper" else {}) | changes))
 
     def tracker_config(self) -> TrackerConfig:
-        """What is trained."""
+        """The settings of the tracker that is trained."""
         return TrackerConfig.preset(self.preset, **self.tracker)
 
     @property
     def total(self) -> int:
-        """Steps of both stages."""
+        """Steps of both stages; with a time budget, the number of its equal parts."""
         return self.matching_steps + self.steps
 
     def to_dict(self) -> dict[str, Any]:
@@ -139,7 +147,7 @@ class TrainConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainConfig:
-        """The inverse of `to_dict`; what an older file lacks has its default.
+        """The inverse of `to_dict`; fields that an older file lacks get their defaults.
 
         Raises:
             ValueError: unknown names.

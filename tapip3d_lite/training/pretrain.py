@@ -1,8 +1,9 @@
-"""Teaching the encoder alone, first: the same surface point should have the same feature in any two frames.
+"""Pretraining of the encoder by matching: a surface point should have the same feature in any two frames.
 
-Stands in for the paper's initialisation from CoTracker3's encoder (section 4, "implementation"). The loss is InfoNCE:
-a point's feature in one frame is compared with every cell of the other, and should prefer the cells where the point
-really is, by as much as tells where between their centres. It costs minutes, and trackers that start from such features leave the zero-motion solution much sooner.
+Ours; it replaces the paper's initialisation from CoTracker3's encoder. The loss is InfoNCE: a point's feature in one
+frame is compared with every cell of the other frame, and the target is a small Gaussian around the true place, so that
+the similarities also say where between the cells' centres the point is. It takes minutes, and a tracker that starts from
+such features learns to follow motion in fewer steps.
 """
 
 from __future__ import annotations
@@ -20,25 +21,25 @@ from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import project
 from tapip3d_lite.model.blocks import constant
 from tapip3d_lite.training.augment import AugmentConfig, augment
-from tapip3d_lite.training.sampling import load_part
+from tapip3d_lite.training.data import load_part
 
 _ENOUGH = 16  # points that two frames should share
-_NEAR = 2.5  # cells around the true place among which a point is placed
+_NEAR = 2.5  # radius in cells, around the true place, of the cells whose mean gives a point's place
 
 
 @dataclass(frozen=True)
 class MatchingConfig:
-    """How the encoder is taught to match.
+    """How the encoder is pretrained.
 
     Attributes:
-        pairs: of frames, a step (of each process).
-        points: most points of a pair of frames.
-        gap: greatest number of frames between the two.
-        levels: pyramid levels at which features are compared, each weighing half of the one before.
+        pairs: number of pairs of frames in a step (of each process).
+        points: greatest number of points of a pair.
+        gap: greatest distance of the two frames.
+        levels: pyramid levels at which features are compared; each has half the weight of the one before.
         spread: standard deviation of the target around the true place, in cells.
-        place: weight of the distance, in cells, between the true place and the mean of the cells around it, each
-            weighing as its similarity; it teaches to place a point within a cell.
-        jitter: strength of random brightness and contrast, drawn for each frame (without augmentation).
+        place: weight of the distance, in cells, between the true place and the mean of the cells around it, weighted by
+            their similarities. This teaches the place within a cell.
+        jitter: strength of random brightness and contrast, drawn for each frame (without `augment`).
         lr, weight_decay, clip_norm: of AdamW with one cycle.
     """
 
@@ -55,20 +56,20 @@ class MatchingConfig:
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Two frames and where the same points are in both.
+class FramePair:
+    """Two frames, and the places of the same points in both.
 
     Attributes:
-        rgb: (2, 3, H, W) in [0, 1].
+        rgb: (2, 3, H, W) colours in [0, 1].
         uv: (2, N, 2) pixels.
     """
 
     rgb: Tensor
     uv: Tensor
 
-    def to(self, device: torch.device | str) -> Pair:
+    def to(self, device: torch.device | str) -> FramePair:
         """The pair on another device."""
-        return Pair(self.rgb.to(device), self.uv.to(device))
+        return FramePair(self.rgb.to(device), self.uv.to(device))
 
 
 def draw_pair(
@@ -77,16 +78,16 @@ def draw_pair(
     config: MatchingConfig,
     size: tuple[int, int] | None = None,
     augmentation: AugmentConfig | None = None,
-) -> Pair:
-    """Two random frames of a clip with points that both show, changed at random.
+) -> FramePair:
+    """Draw two frames of a clip and points that are visible in both, and augment them.
 
     Args:
-        path: an npz with tracks.
-        rng: source of chance.
-        config: how far apart the frames may be, and how many points.
-        size: (H, W) wanted; None: as stored.
-        augmentation: changes the frames as the tracker's training does, where enough points remain; None: they are
-            only mirrored and re-coloured by `jitter`.
+        path: an npz file with tracks.
+        rng: random generator.
+        config: greatest distance of the frames, and number of points.
+        size: (H, W) of the frames; None keeps the stored size.
+        augmentation: of the tracker's training, used where enough points stay visible; None: the frames are only
+            mirrored, and their brightness and contrast changed by `jitter`.
     """
     clip, points = _two_frames(path, rng, config.gap, size)
     if augmentation is not None:
@@ -98,11 +99,11 @@ def draw_pair(
     rgb = np.ascontiguousarray(clip.video.transpose(0, 3, 1, 2)).astype(np.float32) / 255
     if augmentation is None:
         rgb, uv = _vary(rgb, uv, rng, config.jitter)
-    return Pair(torch.from_numpy(rgb), torch.from_numpy(uv))
+    return FramePair(torch.from_numpy(rgb), torch.from_numpy(uv))
 
 
 def _vary(rgb: np.ndarray, uv: np.ndarray, rng: np.random.Generator, jitter: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror both frames alike and change each one's brightness and contrast: light enough for every step on a CPU."""
+    """Mirror both frames in the same way, and change brightness and contrast of each; fast enough for a CPU."""
     for axis in (0, 1):  # u, v
         if rng.random() < 0.5:
             uv[..., axis] = rgb.shape[3 - axis] - 1 - uv[..., axis]
@@ -115,7 +116,7 @@ def _vary(rgb: np.ndarray, uv: np.ndarray, rng: np.random.Generator, jitter: flo
 def _two_frames(
     path: str | Path, rng: np.random.Generator, gap: int, size: tuple[int, int] | None
 ) -> tuple[Clip, np.ndarray]:
-    """Frames at most `gap` apart, nearer ones where these share too few points, and the points that both show."""
+    """Frames at most `gap` apart, less where they share too few points, and the points visible in both."""
 
     def choose(available: int) -> np.ndarray:
         distance = min(int(rng.integers(1, gap + 1)), available - 1)
@@ -130,17 +131,17 @@ def _two_frames(
         gap = max(gap // 2, 1)
 
 
-def matching_loss(encoder: nn.Module, pairs: Sequence[Pair], config: MatchingConfig) -> tuple[Tensor, Tensor]:
-    """InfoNCE over all cells of the other frame, and how far off the similar cells near the true place are.
+def matching_loss(encoder: nn.Module, pairs: Sequence[FramePair], config: MatchingConfig) -> tuple[Tensor, Tensor]:
+    """InfoNCE over all cells of the other frame, plus the distance of the place that the similarities near it give.
 
     Args:
-        encoder: (P, 2, 3, H, W) to (P, 2, C, h, w).
-        pairs: P times two frames.
-        config: levels and their target.
+        encoder: maps (P, 2, 3, H, W) to (P, 2, C, h, w).
+        pairs: P pairs of frames.
+        config: levels and target.
 
     Returns:
-        The loss, and the share of points whose most similar cell of the finest level lies within 1.5 cells; means over
-        pairs.
+        The loss, and the share of points whose most similar cell of the finest level is within 1.5 cells of the true
+        place; both are means over pairs.
     """
     maps = encoder(torch.stack([pair.rgb for pair in pairs]))
     with torch.autocast(maps.device.type, enabled=False):
@@ -148,7 +149,7 @@ def matching_loss(encoder: nn.Module, pairs: Sequence[Pair], config: MatchingCon
     return tuple(torch.stack(values).mean() for values in zip(*losses, strict=True))
 
 
-def _pair_loss(maps: Tensor, pair: Pair, config: MatchingConfig) -> tuple[Tensor, Tensor]:
+def _pair_loss(maps: Tensor, pair: FramePair, config: MatchingConfig) -> tuple[Tensor, Tensor]:
     total = right = torch.zeros((), device=pair.uv.device)
     size = constant((float(pair.rgb.shape[3]), float(pair.rgb.shape[2])), pair.uv)
     for level in range(config.levels):
@@ -173,7 +174,7 @@ def _pair_loss(maps: Tensor, pair: Pair, config: MatchingConfig) -> tuple[Tensor
 
 
 def _similarity(maps: Tensor, cells: Tensor) -> Tensor:
-    """How alike features at cells (N, 2) of the first map are to every cell of the second; maps (2, C, h, w)."""
+    """Similarity (N, h w) of the features at cells (N, 2) of the first map to every cell of the second; maps (2, C, h, w)."""
     height, width = maps.shape[-2:]
     normed = F.layer_norm(maps.movedim(1, -1), maps.shape[1:2])  # as the tracker's tokens are
     grid = cells / constant((width - 1.0, height - 1.0), cells) * 2 - 1
