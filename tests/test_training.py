@@ -5,10 +5,10 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
+from lessons.saved_bytes import SavedBytes
 from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.training.backward import plain_backward, saving_backward
 from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
-from lessons.saved_bytes import SavedBytes
 from tests.tiny import SIZES
 
 

@@ -1,17 +1,15 @@
-"""Figures and live plot of notebook 06, by their state; how many steps fit into a time; the miniature chain."""
+"""Figures and live plot of notebook 06, by their state; the miniature chain."""
 
 import asyncio
 import json
 import signal
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from tapip3d_lite.training.plan import fit_to_time
 
 import tapip3d_lite as t3d
 from lessons.n06 import LivePlot, learning_curve, tracks_and_truth, train_live
@@ -19,21 +17,16 @@ from lessons.n06_augmentations import TITLES, before_and_after, motion_paths
 from lessons.n06_chain import Chain, plain, saving
 from tapip3d_lite.figures.curves import learning_curves
 from tapip3d_lite.figures.flat import MOVING
+from tapip3d_lite.lab import make_trainer
 from tapip3d_lite.simulate import simulate_dataset
-from tapip3d_lite.training import plan
-from tapip3d_lite.training.data import SamplingConfig
-from tapip3d_lite.training.recipe import TrainConfig
-from tapip3d_lite.training.trainer import Trainer
-
-ROOT = Path(__file__).resolve().parents[1]
-SIZES = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16}
-SIZES |= {"context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2}
-SIZES |= {"time_depth": 1, "space_depth": 1, "virtual_tracks": 4}
+from tests import tiny
 
 
 def recipe(**changes):
-    settings = {"tracker": SIZES, "frames": (4, 4), "sampling": SamplingConfig(tracks=6), "save_every": 100}
-    return TrainConfig(**(settings | {"matching_steps": 2, "steps": 4, "evaluate_every": 2, "validation": 1} | changes))
+    """A training of 2 + 4 steps."""
+    return tiny.recipe(
+        **({"matching_steps": 2, "steps": 4, "frames": (4, 4), "evaluate_every": 2, "save_every": 100} | changes)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +44,8 @@ def lines():
     return first + then
 
 
-def watched(trainer, minutes=5.0, **options):
-    return asyncio.run(train_live(trainer, minutes, **options))
+def watched(trainer, **options):
+    return asyncio.run(train_live(trainer, **options))
 
 
 def drawn(ax):
@@ -88,9 +81,9 @@ def test_trainings_have_a_row_each_and_the_command_draws_them(lines, tmp_path):
     assert texts == [[], ["as it was"]]  # a training that takes its encoder as it finds it
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     command = [sys.executable, "-m", "tapip3d_lite", "curves", "--out", str(tmp_path / "c.png")]
-    subprocess.run([*command, str(tmp_path), str(tmp_path / "log.jsonl")], check=True, cwd=ROOT)
+    subprocess.run([*command, str(tmp_path), str(tmp_path / "log.jsonl")], check=True, cwd=tiny.ROOT)
     assert (tmp_path / "c.png").read_bytes()[:4] == b"\x89PNG"
-    absent = subprocess.run([*command, str(tmp_path / "none")], cwd=ROOT, capture_output=True, text=True)
+    absent = subprocess.run([*command, str(tmp_path / "none")], cwd=tiny.ROOT, capture_output=True, text=True)
     assert absent.returncode == 2 and "no such log" in absent.stderr
 
 
@@ -126,21 +119,21 @@ def test_the_live_plot_is_drawn_anew_and_can_be_stopped(lines):
 @pytest.fixture
 def trainer(tmp_path, clips):
     held_out = [t3d.load_clip(clips[0])]
-    return Trainer(tmp_path / "run", recipe(), clips, held_out)
+    return make_trainer(tmp_path / "run", recipe(), clips, held_out)
 
 
 def test_training_watched_goes_to_the_end(trainer):
     lines = watched(trainer, every=0.01)
     assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
     assert sum("val_APD3D_none" in line for line in lines) == 2
-    assert (trainer.journal.folder / "weights.safetensors").exists()
+    assert (trainer.folder.path / "weights.safetensors").exists()
 
 
 def test_what_was_stopped_goes_on(trainer, monkeypatch):
     monkeypatch.setattr(LivePlot, "stopped", property(lambda live: len(live.lines) >= 3))
     assert len(watched(trainer)) == 3
-    assert (trainer.journal.folder / "checkpoint.pt").exists()
-    assert len(watched(trainer, minutes=0)) == 4  # the button, and the time: each after one more step
+    assert (trainer.folder.path / "checkpoint.pt").exists()
+    assert len(watched(trainer)) == 4  # the button again, after one more step
     monkeypatch.undo()
     assert [line["step"] for line in watched(trainer)] == [1, 2, 3, 4, 5, 6]
 
@@ -157,8 +150,8 @@ def test_interrupting_the_kernel_stops_between_two_steps(trainer, monkeypatch):
     monkeypatch.setattr(trainer, "_one_step", interrupted)
     lines = watched(trainer)
     assert len(lines) == trainer.step == 3 and signal.getsignal(signal.SIGINT) == before
-    assert len((trainer.journal.folder / "log.jsonl").read_text().splitlines()) == 3
-    assert (trainer.journal.folder / "checkpoint.pt").exists()
+    assert len((trainer.folder.path / "log.jsonl").read_text().splitlines()) == 3
+    assert (trainer.folder.path / "checkpoint.pt").exists()
 
 
 def test_drawing_takes_a_small_share_of_the_time(trainer, monkeypatch):
@@ -173,13 +166,13 @@ def test_drawing_takes_a_small_share_of_the_time(trainer, monkeypatch):
     monkeypatch.setattr(LivePlot, "draw", slow)
     step = trainer._one_step
     monkeypatch.setattr(trainer, "_one_step", lambda: (clock.__setitem__(0, clock[0] + 100.0), step())[1])
-    watched(trainer, minutes=1e6)
+    watched(trainer)
     assert drawings == [0, 110, 420, 630]  # first, after a step, when ten seconds are a twentieth, and last
 
 
 def test_the_button_is_heard_between_two_steps(trainer, monkeypatch):
     async def cell():
-        training = asyncio.create_task(train_live(trainer, 5))
+        training = asyncio.create_task(train_live(trainer))
         while trainer.step < 2:
             await asyncio.sleep(0)
         shown[0].press()
@@ -197,39 +190,6 @@ def test_what_goes_wrong_while_watched_is_raised(trainer, monkeypatch):
     monkeypatch.setattr(trainer, "_one_step", fail)
     with pytest.raises(FloatingPointError, match="not finite"):
         watched(trainer)
-
-
-def test_steps_fit_the_time(monkeypatch, clips):
-    class Fake:
-        def __init__(self, folder, config, paths, device):
-            assert len(paths) == 2 and config.validation == 0
-            self.config = config
-
-        def run(self, watch, progress):
-            seconds = 0.0
-            for i in range(self.config.total):
-                first = i < self.config.matching_steps
-                warm = i % self.config.steps < 3  # not to be counted
-                seconds += 50 if warm else 0.1 if first else 0.5
-                watch({"stage": "matching" if first else "tracking", "seconds": seconds})
-
-    monkeypatch.setattr(plan, "Trainer", Fake)
-    monkeypatch.setattr(plan, "_encoding", lambda *_: 10.0)
-    fitted = fit_to_time(recipe(), [*clips, "more"], seconds=100, matching=0.2)  # 4 clips, or fewer
-    assert (fitted.matching_steps, fitted.steps) == (200, round((80 - 10 * (len(clips) + 1)) / 0.5))
-    many = fit_to_time(recipe(), [*clips * 100], seconds=100, matching=0.2)  # each step meets a new one
-    assert many.steps == round(80 / 10.5)
-    monkeypatch.setattr(plan, "_encoding", lambda *_: 0.0)
-    assert fit_to_time(recipe(), clips, seconds=100, matching=0).total == 200
-    assert fit_to_time(recipe(), clips, seconds=0.01).total == 2
-    for wrong in ({"seconds": 0}, {"seconds": 1, "matching": 1.0}):
-        with pytest.raises(ValueError, match="fit_to_time"):
-            fit_to_time(recipe(), clips, **wrong)
-
-
-def test_steps_are_timed_for_real(clips):
-    fitted = fit_to_time(recipe(), clips, seconds=2, probe=1)
-    assert fitted.steps >= 1 and json.dumps(fitted.to_dict())
 
 
 def test_the_chain_watches_what_autograd_holds():

@@ -16,6 +16,7 @@ from lessons.checker import check, score_guess
 from lessons.n06_augmentations import before_and_after, motion_paths
 from lessons.n06_chain import Chain
 from lessons.n06_exercises import EXERCISES
+from lessons.saved_bytes import SavedBytes
 from lessons.widgets import explore
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures import png_bytes
@@ -29,6 +30,7 @@ from tapip3d_lite.training.trainer import Trainer
 __all__ = [
     "EXERCISES",
     "Chain",
+    "SavedBytes",
     "before_and_after",
     "check",
     "explore",
@@ -118,9 +120,9 @@ class LivePlot:
 
 
 async def train_live(
-    trainer: Trainer, minutes: float, zero_motion: Mapping[str, float] | None = None, every: float = 5.0
+    trainer: Trainer, zero_motion: Mapping[str, float] | None = None, every: float = 5.0
 ) -> list[Line]:
-    """Train in a notebook's cell, watched: until the end, the time is up, Stop, or "Kernel, Interrupt".
+    """Train in a notebook's cell, watched: until the recipe's end, Stop, or "Kernel, Interrupt".
 
     To be awaited: between two steps the kernel listens to the button. It is the cell's own thread that trains; in
     another one a step takes twice as long on two cores, as OpenMP then lets its two teams of threads sleep instead of
@@ -128,7 +130,6 @@ async def train_live(
 
     Args:
         trainer: as it stands.
-        minutes: at most, of wall-clock time.
         zero_motion: scores of zero motion, drawn dashed.
         every: seconds between two drawings, at least; more where drawing would take more than a twentieth of the time.
 
@@ -138,14 +139,13 @@ async def train_live(
     Raises:
         FloatingPointError: the loss is not finite; the trainer has saved the batch.
     """
-    log = trainer.journal.folder / "log.jsonl"
+    log = trainer.folder.path / "log.jsonl"
     live = LivePlot(read_log(log) if log.exists() else (), zero_motion)
-    end = time.monotonic() + 60 * minutes
     due = time.monotonic() + every
     display(live.box)
     try:
         with interruptible() as interrupted:
-            for line in trainer.steps(lambda: live.stopped or interrupted() or time.monotonic() > end):
+            for line in trainer.steps(lambda: live.stopped or interrupted()):
                 live.lines.append(line)
                 begun = time.monotonic()
                 if begun > due:
