@@ -9,7 +9,8 @@ from tapip3d_lite.geometry import project, unproject
 from tapip3d_lite.simulate import SimulationConfig, simulate_clip, simulate_dataset, simulator
 from tapip3d_lite.simulate.bodies import random_scene
 from tapip3d_lite.simulate.cameras import random_path
-from tapip3d_lite.simulate.physics import UnstableSceneError, geom_poses, roll_out
+from tapip3d_lite.simulate.physics import UnstableSceneError, roll_out
+from tapip3d_lite.simulate.render import Shots
 from tapip3d_lite.simulate.settings import CAMERAS, SHAPES
 from tapip3d_lite.simulate.tracks import point_visibility, sample_pixels
 
@@ -85,7 +86,7 @@ def test_visibility_is_exact_at_silhouettes():
     path = random_path(rng, config)
     scene = random_scene(rng, config, 0.0)
     states = roll_out(scene, 1, 12.0, np.zeros(1))[:, 0]
-    center, radius = geom_poses(scene, states)[0, -1, :3, 3], scene.bodies[0].half[0]
+    center, radius = next(scene.posed(states)).geom_xpos[-1], scene.bodies[0].half[0]
     extrinsics = path.extrinsics(np.zeros(1))
     eye = -extrinsics[0, :3, :3].T @ extrinsics[0, :3, 3]
     normal = rng.normal(size=(4000, 3))
@@ -99,10 +100,9 @@ def test_visibility_is_exact_at_silhouettes():
     uv, _ = project(points, path.intrinsics, extrinsics[0])
     expected = ((eye - points) * normal).sum(-1) > 0
     expected &= (uv >= -0.5).all(-1) & (uv < 127.5).all(-1)
-    geom = np.full(4000, scene.first_body)
-    visible = point_visibility(
-        scene, states, points[None], normal[None], geom, path.intrinsics, extrinsics, config.size
-    )
+    empty = np.zeros((1, *config.size))
+    shots = Shots(scene, states, path.intrinsics, extrinsics, np.eye(4), empty, empty, empty)
+    visible = point_visibility(shots, points[None], normal[None])
     assert 0.2 < expected.mean() < 0.8
     np.testing.assert_array_equal(visible[0], expected)
 

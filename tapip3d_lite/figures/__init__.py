@@ -15,28 +15,12 @@ from IPython import get_ipython
 from IPython.display import display
 from matplotlib.figure import Figure
 
-from tapip3d_lite.figures.flat import (
-    contact_sheet,
-    depth_map,
-    frame_with_tracks,
-    overview,
-    track_colors,
-)
+from tapip3d_lite.figures.flat import contact_sheet, depth_map, frame_with_tracks, overview, track_colors
 from tapip3d_lite.figures.scene_3d import tracks_3d, tracks_3d_static
 from tapip3d_lite.files import atomic_path
 
-__all__ = [
-    "contact_sheet",
-    "depth_map",
-    "frame_with_tracks",
-    "overview",
-    "save_html",
-    "save_png",
-    "show_3d",
-    "track_colors",
-    "tracks_3d",
-    "tracks_3d_static",
-]
+__all__ = ["contact_sheet", "depth_map", "frame_with_tracks", "overview", "track_colors"]
+__all__ += ["save_html", "save_png", "show_3d", "tracks_3d", "tracks_3d_static"]
 
 
 class show_3d:
@@ -84,11 +68,6 @@ def save_html(figure: go.Figure, path: str | Path) -> None:
         temporary.write_text(figure.to_html(include_plotlyjs=True, auto_play=False, validate=False), encoding="utf-8")
 
 
-def _show_in_notebooks() -> None:
-    """Let a notebook show a bare `Figure` as PNG; IPython does so only for figures that pyplot made."""
-    shell = get_ipython()
-    if shell is not None:
-        shell.display_formatter.formatters["image/png"].for_type(Figure, png_bytes)
-
-
-_show_in_notebooks()
+shell = get_ipython()
+if shell is not None:  # a notebook then shows a bare `Figure` as PNG; else only figures that pyplot made
+    shell.display_formatter.formatters["image/png"].for_type(Figure, png_bytes)

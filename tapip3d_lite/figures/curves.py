@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -14,21 +15,13 @@ from tapip3d_lite.evaluation.benchmark import SPLITS, Results, estimate
 from tapip3d_lite.figures.flat import INK, MOVING, STILL, label_axes
 
 COLORS = ("#8a8f98", "#e8a33d", "#2b6cb0", "#d1495b", "#2f855a", "#6b46c1")
-NAMES = {
-    "AJ3D_none": "AJ 3D",
-    "APD3D_none": "APD 3D",
-    "AJ3D": "AJ 3D, median scale",
-    "APD3D": "APD 3D, median scale",
-    "OA": "OA",
-}
+NAMES = {"AJ3D_none": "AJ 3D", "APD3D_none": "APD 3D", "AJ3D": "AJ 3D, median scale", "APD3D": "APD 3D, median scale"}
 Line = Mapping[str, Any]
 _SERIES = {"apd": ("all points", STILL), "apd_dynamic": ("moving points", MOVING)}
 
 
 def score_figure(
-    results: Results,
-    metrics: Sequence[str] = ("AJ3D_none", "APD3D_none", "OA"),
-    splits: Sequence[str] = SPLITS,
+    results: Results, metrics: Sequence[str] = ("AJ3D_none", "APD3D_none", "OA"), splits: Sequence[str] = SPLITS
 ) -> Figure:
     """Dots with 95 % bootstrap intervals over clips: one panel a split, filled for all points, hollow for dynamic ones.
 
@@ -43,18 +36,23 @@ def score_figure(
     splits = [split for split in splits if any(split in scores for scores in results.values())]
     if not splits:
         raise ValueError("score_figure: no scores on these splits; run the benchmark first")
-    step = len(results) + 1.0
+    colors, step = dict(zip(results, cycle(COLORS), strict=False)), len(results) + 1.0
     figure = Figure(figsize=(3.4 * len(splits), 1.0 + 0.24 * step * len(metrics)), layout="constrained")
     axes = figure.subplots(1, len(splits), squeeze=False, sharey=True)[0]
     for ax, split in zip(axes, splits, strict=True):
         for row, metric in enumerate(metrics):
-            _dots(ax, results, split, metric, row * step)
-        _dress(ax, split)
-    axes[0].set_yticks([row * step + (step - 2) / 2 for row in range(len(metrics))])
-    axes[0].set_yticklabels([NAMES.get(metric, metric) for metric in metrics])
+            _dots(ax, results, split, metric, row * step, colors)
+        ax.set_title(split, fontsize=10, color=INK)
+        ax.set_xlabel("mean over clips, 95 % interval", fontsize=8, color=INK)
+        ax.set(xlim=(0, 1), axisbelow=True)
+        ax.grid(axis="x", color="#e3e5e8", lw=0.7)
+        ax.spines[["top", "right", "left"]].set_visible(False)
+        ax.tick_params(length=0, labelsize=8, colors=INK)
+    axes[0].set_yticks([(row + 0.5) * step - 1 for row in range(len(metrics))], [NAMES.get(m, m) for m in metrics])
     axes[0].set_ylim(step * len(metrics) - 1, -1)
-    handles = [_mark(color, True, label) for color, label in zip(_colors(results), results, strict=True)]
-    handles += [_mark(INK, True, "all points"), _mark(INK, False, "points on moving bodies")]
+    marks = [(color, True, label) for label, color in colors.items()]
+    marks += [(INK, True, "all points"), (INK, False, "points on moving bodies")]
+    handles = [Line2D([], [], label=label, **_dot(color, filled)) for color, filled, label in marks]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8)
     return figure
 
@@ -81,92 +79,68 @@ def learning_curves(
     figure = Figure(figsize=(11, 2.9 * len(logs)), layout="constrained")
     rows = figure.subplots(len(logs), 3, squeeze=False)
     for axes, (name, lines) in zip(rows, logs, strict=True):
-        _row(axes, lines, zero_motion, by, window)
+        _row(axes, lines, zero_motion or {}, by, window)
         if name:
             axes[0].set_ylabel(f"{name}\n\n{axes[0].get_ylabel()}", fontsize=8)
     return figure
 
 
-def _dots(ax: Axes, results: Results, split: str, metric: str, top: float) -> None:
-    for index, (color, label) in enumerate(zip(_colors(results), results, strict=True)):
+def _dots(ax: Axes, results: Results, split: str, metric: str, top: float, colors: Mapping[str, str]) -> None:
+    for index, label in enumerate(results):
         if split not in results[label]:
             continue
         for part, shift in (("", -0.17), ("_dynamic", 0.17)):
             value, y = estimate(results, label, split, metric + part), top + index + shift
-            ax.plot([value.low, value.high], [y, y], color=color, lw=1.6, alpha=0.75, solid_capstyle="round")
-            ax.plot(value.mean, y, "o", ms=5, color=color, mfc="white" if part else color, mew=1.3)
+            ax.plot([value.low, value.high], [y, y], color=colors[label], lw=1.6, alpha=0.75, solid_capstyle="round")
+            ax.plot(value.mean, y, **_dot(colors[label], filled=not part))
 
 
-def _dress(ax: Axes, split: str) -> None:
-    ax.set_title(split, fontsize=10, color=INK)
-    ax.set_xlim(0, 1)
-    ax.grid(axis="x", color="#e3e5e8", lw=0.7)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right", "left"]].set_visible(False)
-    ax.tick_params(length=0, labelsize=8, colors=INK)
-    ax.set_xlabel("mean over clips, 95 % interval", fontsize=8, color=INK)
+def _dot(color: str, filled: bool) -> dict[str, Any]:
+    return {"marker": "o", "ms": 5, "color": color, "mfc": color if filled else "white", "mew": 1.3, "ls": ""}
 
 
-def _colors(results: Results) -> list[str]:
-    return [COLORS[index % len(COLORS)] for index in range(len(results))]
-
-
-def _mark(color: str, filled: bool, label: str) -> Line2D:
-    return Line2D([], [], marker="o", ls="", ms=5, color=color, mfc=color if filled else "white", mew=1.3, label=label)
-
-
-def _row(
-    axes: Sequence[Axes], lines: Sequence[Line], zero_motion: Mapping[str, float] | None, by: str, window: int
-) -> None:
-    stages = [[line for line in lines if line["stage"] == name] for name in ("matching", "tracking")]
-    _curve(axes[0], stages[0], "right", by, window, INK)
-    _curve(axes[1], stages[1], "loss", by, window, INK)
-    for name, (label, color) in _SERIES.items():
-        _curve(axes[2], stages[1], name, by, window, color, label)
-        _held_out(axes[2], stages[1], name.replace("apd", "APD3D_none"), by, zero_motion or {}, color)
+def _row(axes: Sequence[Axes], lines: Sequence[Line], zero_motion: Mapping[str, float], by: str, window: int) -> None:
+    matching, tracking = ([line for line in lines if line["stage"] == name] for name in ("matching", "tracking"))
     titles = (
         "the encoder learns to match",
         "the tracker learns to track",
         "bold: examples · dots: held out · dashed: zero motion",
     )
-    labels = "right within 1.5 cells", "loss", "APD3D"
-    for ax, title, label in zip(axes, titles, labels, strict=True):
+    for ax, title, label in zip(axes, titles, ("right within 1.5 cells", "loss", "APD3D"), strict=True):
         label_axes(ax, label, by)
         ax.set_title(title, fontsize=8, color=INK)
-    if stages[1] and not stages[0]:
+    _curve(axes[0], *_points(matching, "right", by), window, INK)
+    _curve(axes[1], *_points(tracking, "loss", by), window, INK)
+    for name, (label, color) in _SERIES.items():
+        _curve(axes[2], *_points(tracking, name, by), window, color, label)
+        held_out = name.replace("apd", "APD3D_none")
+        axes[2].plot(*_points(tracking, f"val_{held_out}", by), "o", color=color, ms=5, mec="white", mew=0.6)
+        if held_out in zero_motion:
+            axes[2].axhline(zero_motion[held_out], color=color, lw=1, ls="--")
+    if tracking and not matching:
         axes[0].text(0.5, 0.5, "as it was", ha="center", color=INK, fontsize=8, transform=axes[0].transAxes)
         axes[0].set(xticks=[], yticks=[])
     axes[0].set_ylim(0, 1)
     axes[2].set_ylim(0, 1)
-    if stages[1]:
+    if tracking:
         axes[1].set_yscale("log")
         axes[1].tick_params(which="minor", labelsize=7)
         axes[2].legend(fontsize=7, frameon=False, loc="upper left")
 
 
-def _curve(
-    ax: Axes, lines: Sequence[Line], name: str, by: str, window: int, color: str, label: str | None = None
-) -> None:
+def _points(lines: Sequence[Line], name: str, by: str) -> tuple[np.ndarray, np.ndarray]:
+    """Where on the horizontal axis the lines have a value of that name, and the values."""
     known = [line for line in lines if line.get(name) is not None]
-    if not known:
+    x = [line["step"] if by == "step" else line["seconds"] / 60 for line in known]
+    return np.array(x), np.array([line[name] for line in known])
+
+
+def _curve(ax: Axes, x: np.ndarray, y: np.ndarray, window: int, color: str, label: str | None = None) -> None:
+    """Raw values, faint, and in bold their means over the last `window`."""
+    if not len(y):
         return
-    x, y = _axis(known, by), np.array([line[name] for line in known])
     sums = np.concatenate([[0.0], np.cumsum(y)])
     stops = np.arange(1, len(y) + 1)
     starts = np.maximum(stops - window, 0)
     ax.plot(x, y, color=color, lw=0.4, alpha=0.25)
     ax.plot(x, (sums[stops] - sums[starts]) / (stops - starts), color=color, lw=1.8, label=label)
-
-
-def _held_out(
-    ax: Axes, lines: Sequence[Line], name: str, by: str, zero_motion: Mapping[str, float], color: str
-) -> None:
-    scored = [line for line in lines if f"val_{name}" in line]
-    values = [line[f"val_{name}"] for line in scored]
-    ax.plot(_axis(scored, by), values, "o", color=color, ms=5, mec="white", mew=0.6)
-    if name in zero_motion:
-        ax.axhline(zero_motion[name], color=color, lw=1, ls="--")
-
-
-def _axis(lines: Sequence[Line], by: str) -> np.ndarray:
-    return np.array([line["step"] if by == "step" else line["seconds"] / 60 for line in lines])

@@ -8,7 +8,6 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project
@@ -28,11 +27,7 @@ def track_colors(clip: Clip, tracks: Tracks) -> np.ndarray:
 
 
 def check_drawable(clip: Clip, tracks: Tracks | None = None, frame: int = 0) -> None:
-    """Refuse a frame outside the clip, or tracks of another length, before a figure fails on them.
-
-    Raises:
-        ValueError: such a frame or such tracks.
-    """
+    """Refuse (ValueError) a frame outside the clip, or tracks of another length, before a figure fails on them."""
     if not 0 <= frame < len(clip):
         raise ValueError(f"frame: expected 0 to {len(clip) - 1} (clip {clip.name!r}), got {frame}; choose another")
     if tracks is not None and len(tracks.xyz) != len(clip):
@@ -57,15 +52,13 @@ def frame_with_tracks(
     check_drawable(clip, tracks, frame)
     ax = ax or _axes(clip)
     draw_image(ax, clip.video[frame], f"{clip.name} · frame {frame}")
-    start = max(0, frame - tail)
-    span = slice(start, frame + 1)
+    span = slice(max(0, frame - tail), frame + 1)
     uv, z = project(tracks.xyz[span], clip.intrinsics[span], clip.extrinsics[span])
     uv = np.where((z > 0)[..., None], uv, np.nan)
     colors = track_colors(clip, tracks)
     for n in range(uv.shape[1]):
         ax.plot(uv[:, n, 0], uv[:, n, 1], color=colors[n], lw=1.1, alpha=0.85)
-    seen = tracks.visible[frame]
-    now = uv[-1]
+    seen, now = tracks.visible[frame], uv[-1]
     ax.scatter(*now[~seen].T, s=11, facecolors="none", edgecolors=colors[~seen], linewidths=0.8)
     ax.scatter(*now[seen].T, s=11, c=colors[seen], edgecolors="white", linewidths=0.3)
     if truth is not None:
@@ -78,10 +71,8 @@ def depth_map(clip: Clip, frame: int, ax: Axes | None = None) -> Figure:
     """Depth of one frame with a colour bar in scene units; pixels without depth are grey."""
     check_drawable(clip, frame=frame)
     ax = ax or _axes(clip, extra=0.9)
-    depth = clip.depths[frame]
-    image = _depth(ax, depth, np.quantile(depth[depth > 0], [0, 0.99]) if depth.any() else (0, 1))
+    _draw_depth([ax], clip.depths[[frame]], clip.depths[frame])
     _bare(ax, f"{clip.name} · depth, frame {frame}")
-    _depth_bar(ax.figure, image, [ax])
     return ax.figure
 
 
@@ -89,68 +80,57 @@ def contact_sheet(clips: Clip | Sequence[Clip], frames: int = 6, width: float = 
     """Frames spread over time, one row a clip."""
     clips = [clips] if isinstance(clips, Clip) else list(clips)
     height, wide = clips[0].size
-    figure = _figure(frames * width, len(clips) * width * height / wide + 0.25)
+    figure = Figure(figsize=(frames * width, len(clips) * width * height / wide + 0.25), layout="constrained")
+    grid = figure.subplots(len(clips), frames, squeeze=False)
     for row, clip in enumerate(clips):
-        for column, t in enumerate(np.linspace(0, len(clip) - 1, frames).astype(int)):
-            ax = figure.add_subplot(len(clips), frames, row * frames + column + 1)
-            title = f"t = {t}" if row == 0 else ""
-            draw_image(ax, clip.video[t], title)
-            if column == 0:
-                ax.set_ylabel(clip.name, fontsize=8, color=INK)
+        for ax, t in zip(grid[row], np.linspace(0, len(clip) - 1, frames).astype(int), strict=True):
+            draw_image(ax, clip.video[t], f"t = {t}" if row == 0 else "")
+        grid[row, 0].set_ylabel(clip.name, fontsize=8, color=INK)
     return figure
 
 
 def overview(clip: Clip, tracks: Tracks, columns: int = 4) -> Figure:
     """The picture of a result: frames with tracks above, their depth below."""
-    height, width = clip.size
     check_drawable(clip, tracks)
-    figure = _figure(2.6 * columns + 0.6, 2 * 2.6 * height / width + 0.3)
-    axes = figure.subplots(2, columns, squeeze=False)
-    limits = np.quantile(clip.depths[clip.depths > 0], [0, 0.99])
-    for (above, below), t in zip(axes.T, np.linspace(0, len(clip) - 1, columns).astype(int), strict=True):
-        frame_with_tracks(clip, tracks, t, ax=above)
-        image = _depth(below, clip.depths[t], limits)
-        _bare(below, "")
-    _depth_bar(figure, image, list(axes[1]))
+    height, width = clip.size
+    figure = Figure(figsize=(2.6 * columns + 0.6, 2 * 2.6 * height / width + 0.3), layout="constrained")
+    above, below = figure.subplots(2, columns, squeeze=False)
+    frames = np.linspace(0, len(clip) - 1, columns).astype(int)
+    for ax, t in zip(above, frames, strict=True):
+        frame_with_tracks(clip, tracks, t, ax=ax)
+    _draw_depth(below, clip.depths[frames], clip.depths)
     return figure
 
 
-def _depth(ax: Axes, depth: np.ndarray, limits: Sequence[float]) -> AxesImage:
+def _draw_depth(axes: Sequence[Axes], depths: np.ndarray, span: np.ndarray) -> None:
+    """Draw depths (K, H, W) into K axes, with colours and one bar that cover most of the depths in `span`."""
     cmap = matplotlib.colormaps["viridis_r"].with_extremes(bad="#b8b8b8")
-    return ax.imshow(np.ma.masked_equal(depth, 0), cmap=cmap, vmin=limits[0], vmax=limits[1])
-
-
-def _depth_bar(figure: Figure, image: AxesImage, axes: list[Axes]) -> None:
-    bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02, extend="max")
+    low, high = np.quantile(span[span > 0], [0, 0.99]) if span.any() else (0, 1)
+    for ax, depth in zip(axes, depths, strict=True):
+        image = ax.imshow(np.ma.masked_equal(depth, 0), cmap=cmap, vmin=low, vmax=high)
+        _bare(ax, "")
+    bar = axes[0].figure.colorbar(image, ax=list(axes), fraction=0.046, pad=0.02, extend="max")
     bar.set_label("z-depth (scene units)", fontsize=8)
     bar.ax.tick_params(labelsize=7)
 
 
-def _figure(width: float, height: float) -> Figure:
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def _axes(clip: Clip, side: float = 3.4, extra: float = 0.0) -> Axes:
+def _axes(clip: Clip, extra: float = 0.0) -> Axes:
     height, width = clip.size
-    return _figure(side + extra, side * height / width + 0.25).add_subplot()
+    return Figure(figsize=(3.4 + extra, 3.4 * height / width + 0.25), layout="constrained").add_subplot()
 
 
 def draw_image(ax: Axes, image: np.ndarray, title: str) -> None:
     """Draw an image (H, W, ...) with pixel centres at whole numbers and limits that stay when points are added."""
-    ax.imshow(image)
     height, width = image.shape[:2]
-    ax.set_xlim(-0.5, width - 0.5)
-    ax.set_ylim(height - 0.5, -0.5)
-    ax.set_autoscale_on(False)
+    ax.imshow(image)
+    ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), autoscale_on=False)
     _bare(ax, title)
 
 
 def _bare(ax: Axes, title: str) -> None:
-    ax.set_xticks([])
-    ax.set_yticks([])
+    ax.set(xticks=[], yticks=[])
     ax.set_title(title, fontsize=8, color=INK)
-    for side in ax.spines.values():
-        side.set_visible(False)
+    ax.spines[:].set_visible(False)
 
 
 def label_axes(ax: Axes, vertical: str, horizontal: str) -> None:

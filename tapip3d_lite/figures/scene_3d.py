@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import plotly.graph_objects as go
@@ -14,6 +15,8 @@ from tapip3d_lite.figures.flat import check_drawable, track_colors
 from tapip3d_lite.geometry import invert, transform, unproject
 
 _LEVELS = 12  # colour levels per channel: a code into 1728 colours costs two bytes a point, an RGB string twenty
+_CHANNEL = (np.arange(_LEVELS) * 255 / (_LEVELS - 1)).round().astype(int)
+_CLOUD_COLORS = [f"rgb({r},{g},{b})" for r in _CHANNEL for g in _CHANNEL for b in _CHANNEL]
 
 
 def tracks_3d(
@@ -32,29 +35,23 @@ def tracks_3d(
         title: above the scene.
     """
     check_drawable(clip, tracks)
-    near = _near(clip)
-    tracks = _drawn(clip, tracks, near, max_tracks)
-    colors = track_colors(clip, tracks)
-    parts = [[_cloud(clip, t, points, near), _tails(tracks, t, tail), _heads(tracks, t)] for t in range(len(clip))]
-    frames = [go.Frame(name=str(t), data=[go.Scatter3d(part) for part in now]) for t, now in enumerate(parts)]
-    styles = _styles(colors)
+    clip, tracks = _foreground(clip, tracks, max_tracks)
+    colors = [to_hex(color) for color in track_colors(clip, tracks)]
+    parts = [_moving_parts(clip, tracks, t, points, tail) for t in range(len(clip))]
     # A frame carries only what changes; the rest stays with the traces and the colour axes of the layout.
-    figure = go.Figure(data=[go.Scatter3d(part).update(style) for part, style in zip(parts[0], styles, strict=True)])
-    figure.frames = frames
-    figure.update_layout(
-        title=title or clip.name,
-        scene=_scene(clip, tracks, near),
-        coloraxis=_cloud_colors(),
-        coloraxis2={"colorscale": _color_scale(colors), "cmin": 0, "cmax": max(len(colors) - 1, 1), "showscale": False},
-        title_font_size=14,
-        margin={"l": 0, "r": 0, "t": 34, "b": 0},
-        height=560,
-        showlegend=False,
-        uirevision="keep",  # the reader's view survives every redraw
-        updatemenus=[_play_button()],
-        sliders=[_slider(len(clip))],
-    )
-    return figure
+    frames = [go.Frame(name=str(t), data=[go.Scatter3d(part) for part in now]) for t, now in enumerate(parts)]
+    traces = [go.Scatter3d(part).update(style) for part, style in zip(parts[0], _styles(colors), strict=True)]
+    layout = {
+        "title": {"text": title or clip.name, "font": {"size": 14}},
+        "scene": _scene(clip, tracks),
+        "coloraxis": _color_axis(_CLOUD_COLORS),
+        "coloraxis2": _color_axis(colors),
+        "margin": {"l": 0, "r": 0, "t": 34, "b": 0},
+        "height": 560,
+        "showlegend": False,
+        "uirevision": "keep",  # the reader's view survives every redraw
+    }
+    return go.Figure(data=traces, frames=frames, layout=layout | _controls(len(clip)))
 
 
 def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = None, points: int = 4000) -> Figure:
@@ -69,48 +66,42 @@ def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = 
     frames = [0, len(clip) // 2, len(clip) - 1] if frames is None else list(frames)
     for t in frames:
         check_drawable(clip, tracks, t)
-    near = _near(clip)
-    tracks = _drawn(clip, tracks, near, 120)
+    clip, tracks = _foreground(clip, tracks, 120)
     colors = track_colors(clip, tracks)
     figure = Figure(figsize=(3.4 * len(frames), 2.6), layout="constrained")
     upright = _upright(clip)
-    limits = axis_limits(transform(np.concatenate([_cloud_points(clip, t, 800, near)[0] for t in frames]), upright))
+    limits = axis_limits(transform(np.concatenate([_cloud_points(clip, t, 800)[0] for t in frames]), upright))
     for i, t in enumerate(frames):
         ax = figure.add_subplot(1, len(frames), i + 1, projection="3d", computed_zorder=False)
-        xyz, rgb = _cloud_points(clip, t, points, near)
-        x, y, z = transform(xyz, upright).T
-        ax.scatter(x, z, -y, c=rgb / 255, s=2.2, depthshade=False, linewidths=0)
+        xyz, rgb = _cloud_points(clip, t, points)
+        ax.scatter(*transform(xyz, upright).T, c=rgb / 255, s=2.2, depthshade=False, linewidths=0)
         path = transform(tracks.xyz[max(0, t - 12) : t + 1], upright)
-        for n in range(path.shape[1]):
-            ax.plot(path[:, n, 0], path[:, n, 2], -path[:, n, 1], color=colors[n], lw=1)
-        x, y, z = path[-1].T
-        seen = tracks.visible[t]
-        ax.scatter(x, z, -y, s=9, facecolors=np.where(seen[:, None], colors, 1), edgecolors=colors, depthshade=False)
-        ax.set_xlim(limits[0])
-        ax.set_ylim(limits[2])
-        ax.set_zlim(-limits[1][1], -limits[1][0])
-        ax.set_box_aspect([np.ptp(limits[k]) for k in (0, 2, 1)], zoom=1.6)
+        for n, color in enumerate(colors):
+            ax.plot(*path[:, n].T, color=color, lw=1)
+        faces = np.where(tracks.visible[t][:, None], colors, 1)
+        ax.scatter(*path[-1].T, s=9, facecolors=faces, edgecolors=colors, depthshade=False)
+        ax.set_box_aspect(np.ptp(limits, axis=-1), zoom=1.6)
         ax.view_init(elev=32, azim=-75)
         ax.set_title(f"t = {t}", fontsize=8)
-        ax.set(xticklabels=[], yticklabels=[], zticklabels=[])
+        ax.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], xticklabels=[], yticklabels=[], zticklabels=[])
     return figure
 
 
-def _near(clip: Clip) -> float:
-    """Depth beyond which nothing is drawn: a far backdrop would shrink all that moves to a speck."""
-    return 1.6 * float(np.median(clip.depths[clip.depths > 0]))
+def _foreground(clip: Clip, tracks: Tracks, most: int) -> tuple[Clip, Tracks]:
+    """The clip without its far depths, which would shrink all that moves to a speck, and at most `most` tracks.
 
-
-def _drawn(clip: Clip, tracks: Tracks, near: float, most: int) -> Tracks:
-    """At most `most` tracks, evenly picked from those whose query lies within the drawn depth."""
+    They are evenly picked from those whose query lies within the depths that are left.
+    """
+    near = 1.6 * float(np.median(clip.depths[clip.depths > 0]))
     t = tracks.queries[:, 0].astype(int)
     z = transform(tracks.queries[:, None, 1:], clip.extrinsics[t])[:, 0, 2]
     inside = np.flatnonzero(z <= near) if (z <= near).any() else np.arange(len(z))
-    return tracks.select(inside[:: max(1, -(-len(inside) // most))])
+    picked = tracks.select(inside[:: max(1, -(-len(inside) // most))])
+    return replace(clip, depths=np.where(clip.depths <= near, clip.depths, 0)), picked
 
 
-def _cloud_points(clip: Clip, frame: int, points: int, near: float) -> tuple[np.ndarray, np.ndarray]:
-    v, u = np.nonzero((clip.depths[frame] > 0) & (clip.depths[frame] <= near))
+def _cloud_points(clip: Clip, frame: int, points: int) -> tuple[np.ndarray, np.ndarray]:
+    v, u = np.nonzero(clip.depths[frame])
     pick = np.random.default_rng(frame).permutation(len(v))[:points]
     v, u = v[pick], u[pick]
     uv = np.stack([u, v], -1).astype(np.float32)
@@ -118,32 +109,29 @@ def _cloud_points(clip: Clip, frame: int, points: int, near: float) -> tuple[np.
     return world, clip.video[frame, v, u]
 
 
-def _cloud(clip: Clip, frame: int, points: int, near: float) -> dict[str, object]:
-    xyz, rgb = _cloud_points(clip, frame, points, near)
-    level = (rgb.astype(int) * _LEVELS) // 256
-    code = (level @ [_LEVELS**2, _LEVELS, 1]).astype(np.uint16)
-    x, y, z = xyz.astype(np.float32).T
-    return {"x": x, "y": y, "z": z, "marker": {"color": code}}
-
-
-def _tails(tracks: Tracks, frame: int, tail: int) -> dict[str, object]:
+def _moving_parts(clip: Clip, tracks: Tracks, frame: int, points: int, tail: int) -> list[dict[str, object]]:
+    """What changes over time: of the cloud, the tails and the heads."""
+    cloud, rgb = _cloud_points(clip, frame, points)
+    code = (rgb.astype(int) * _LEVELS) // 256 @ [_LEVELS**2, _LEVELS, 1]
     path = tracks.xyz[max(0, frame - tail) : frame + 1]
     gap = np.full((1, path.shape[1], 3), np.nan, np.float32)  # NaN lifts the pen between tracks
-    x, y, z = np.concatenate([path, gap]).transpose(2, 1, 0).reshape(3, -1)
+    tails = np.concatenate([path, gap]).swapaxes(0, 1).reshape(-1, 3)
     index = np.repeat(np.arange(path.shape[1], dtype=np.uint16), len(path) + 1)
-    return {"x": x, "y": y, "z": z, "line": {"color": index}}
-
-
-def _heads(tracks: Tracks, frame: int) -> dict[str, object]:
-    x, y, z = tracks.xyz[frame].T
     symbols = ["circle" if seen else "circle-open" for seen in tracks.visible[frame]]
-    return {"x": x, "y": y, "z": z, "marker": {"symbol": symbols}}
+    return [
+        _xyz(cloud.astype(np.float32)) | {"marker": {"color": code.astype(np.uint16)}},
+        _xyz(tails) | {"line": {"color": index}},
+        _xyz(tracks.xyz[frame]) | {"marker": {"symbol": symbols}},
+    ]
 
 
-def _styles(colors: np.ndarray) -> list[dict[str, object]]:
+def _xyz(vectors: np.ndarray) -> dict[str, np.ndarray]:
+    return dict(zip("xyz", vectors.T, strict=True))
+
+
+def _styles(colors: list[str]) -> list[dict[str, object]]:
     """What stays alike over time: of the cloud, the tails and the heads."""
-    heads = {"size": 4, "color": [to_hex(c) for c in colors]}
-    text = [f"track {n} (hollow: occluded)" for n in range(len(colors))]
+    heads, text = {"size": 4, "color": colors}, [f"track {n} (hollow: occluded)" for n in range(len(colors))]
     return [
         {"name": "scene", "mode": "markers", "marker": {"size": 2.6, "coloraxis": "coloraxis"}, "hoverinfo": "skip"},
         {"name": "tails", "mode": "lines", "line": {"width": 3, "coloraxis": "coloraxis2"}, "hoverinfo": "skip"},
@@ -151,18 +139,11 @@ def _styles(colors: np.ndarray) -> list[dict[str, object]]:
     ]
 
 
-def _cloud_colors() -> dict[str, object]:
-    """A colour axis that decodes the cloud's colour codes."""
-    channel = (np.arange(_LEVELS) * 255 / (_LEVELS - 1)).round().astype(int)
-    cells = np.stack(np.meshgrid(channel, channel, channel, indexing="ij"), -1).reshape(-1, 3)
-    scale = [[i / (len(cells) - 1), f"rgb({r},{g},{b})"] for i, (r, g, b) in enumerate(cells)]
-    return {"colorscale": scale, "cmin": 0, "cmax": len(cells) - 1, "showscale": False}
-
-
-def _color_scale(colors: np.ndarray) -> list:
-    last = max(len(colors) - 1, 1)
-    scale = [[n / last, to_hex(c)] for n, c in enumerate(colors)] or [[0, "#888888"]]
-    return scale if len(scale) > 1 else [[0, scale[0][1]], [1, scale[0][1]]]
+def _color_axis(colors: list[str]) -> dict[str, object]:
+    """A colour axis on which whole numbers stand for these colours; it needs two at least."""
+    colors = [*colors, "#888888", "#888888"][: max(len(colors), 2)]
+    last = len(colors) - 1
+    return {"colorscale": [[n / last, c] for n, c in enumerate(colors)], "cmin": 0, "cmax": last, "showscale": False}
 
 
 def axis_limits(xyz: np.ndarray) -> np.ndarray:
@@ -171,25 +152,20 @@ def axis_limits(xyz: np.ndarray) -> np.ndarray:
     return np.stack([low, high], -1) + 0.03 * (high - low).max() * np.array([-1, 1])
 
 
-def _scene(clip: Clip, tracks: Tracks, near: float) -> dict[str, object]:
+def _scene(clip: Clip, tracks: Tracks) -> dict[str, object]:
+    """Axes with fixed ranges, seen from behind and above the clip's first camera."""
     steps = np.linspace(0, len(clip) - 1, min(len(clip), 6)).astype(int)
-    cloud = np.concatenate([_cloud_points(clip, t, 800, near)[0] for t in steps])
+    cloud = np.concatenate([_cloud_points(clip, t, 800)[0] for t in steps])
     ranges = axis_limits(np.concatenate([cloud, tracks.xyz[steps].reshape(-1, 3)]))
     axis = {"showspikes": False, "title": {"font": {"size": 10}}, "tickfont": {"size": 9}, "backgroundcolor": "#f4f5f7"}
     axes = {f"{k}axis": axis | {"range": r.tolist(), "autorange": False} for k, r in zip("xyz", ranges, strict=True)}
-    return axes | {"aspectmode": "data", "camera": _camera(clip, np.median(cloud, axis=0), ranges)}
-
-
-def _camera(clip: Clip, target: np.ndarray, ranges: np.ndarray) -> dict[str, object]:
-    """A view from behind and above the clip's first camera, in the scene's own units."""
-    pose = invert(clip.extrinsics[0])
-    up = _up(clip)
-    back = pose[:3, 3] - target
+    up, target = _up(clip), np.median(cloud, axis=0)
+    back = invert(clip.extrinsics[0])[:3, 3] - target
     eye = target + 1.2 * back + 0.3 * np.linalg.norm(back) * up
     # With aspectmode "data" a scene unit is the geometric mean of the three ranges, counted from their middle.
     unit, middle = np.prod(np.ptp(ranges, axis=-1)) ** (1 / 3), ranges.mean(-1)
-    vectors = {"up": up, "eye": (eye - middle) / unit, "center": (target - middle) / unit}
-    return {name: {k: float(x) for k, x in zip("xyz", vector, strict=True)} for name, vector in vectors.items()}
+    camera = {"up": up, "eye": (eye - middle) / unit, "center": (target - middle) / unit}
+    return axes | {"aspectmode": "data", "camera": {name: _xyz(vector) for name, vector in camera.items()}}
 
 
 def _up(clip: Clip) -> np.ndarray:
@@ -200,11 +176,11 @@ def _up(clip: Clip) -> np.ndarray:
 
 
 def _upright(clip: Clip) -> np.ndarray:
-    """A motion (4, 4) from the world to axes right, down and ahead as the first camera sees them, without its pitch."""
-    down, pose = -_up(clip), np.eye(4)
-    right = clip.extrinsics[0, 0, :3] - (clip.extrinsics[0, 0, :3] @ down) * down
+    """A motion (4, 4) from the world to axes right, ahead and up as the first camera sees them, without its pitch."""
+    up, pose = _up(clip), np.eye(4)
+    right = clip.extrinsics[0, 0, :3] - (clip.extrinsics[0, 0, :3] @ up) * up
     right = right / np.linalg.norm(right)
-    pose[:3, :3] = np.stack([right, down, np.cross(right, down)])
+    pose[:3, :3] = np.stack([right, np.cross(up, right), up])
     return pose
 
 
@@ -213,22 +189,12 @@ def animation_args(duration: int) -> dict[str, object]:
     return {"mode": "immediate", "frame": {"duration": duration, "redraw": True}, "transition": {"duration": 0}}
 
 
-def _slider(frames: int) -> dict[str, object]:
+def _controls(frames: int) -> dict[str, object]:
+    """A slider over time and a play button."""
     steps = [{"label": str(t), "method": "animate", "args": [[str(t)], animation_args(0)]} for t in range(frames)]
-    return {"steps": steps, "currentvalue": {"prefix": "frame "}, "x": 0.17, "len": 0.81, "pad": {"t": 4, "b": 24}}
-
-
-def _play_button() -> dict[str, object]:
+    slider = {"steps": steps, "currentvalue": {"prefix": "frame "}, "x": 0.17, "len": 0.81, "pad": {"t": 4, "b": 24}}
     play = {"label": "play", "method": "animate", "args": [None, animation_args(120) | {"fromcurrent": True}]}
     pause = {"label": "pause", "method": "animate", "args": [[None], animation_args(0)]}
-    return {
-        "type": "buttons",
-        "buttons": [play, pause],
-        "direction": "right",
-        "showactive": False,
-        "x": 0.01,
-        "y": 0,
-        "xanchor": "left",
-        "yanchor": "top",
-        "pad": {"t": 18},
-    }
+    place = {"x": 0.01, "y": 0, "xanchor": "left", "yanchor": "top", "pad": {"t": 18}}
+    menu = {"type": "buttons", "buttons": [play, pause], "direction": "right", "showactive": False, **place}
+    return {"updatemenus": [menu], "sliders": [slider]}

@@ -7,12 +7,5 @@ from tapip3d_lite.simulate.rollout import Rollout
 from tapip3d_lite.simulate.settings import SimulationConfig
 from tapip3d_lite.simulate.simulator import object_maps, render_clip, simulate_clip, simulate_rollout
 
-__all__ = [
-    "Rollout",
-    "SimulationConfig",
-    "object_maps",
-    "render_clip",
-    "simulate_clip",
-    "simulate_dataset",
-    "simulate_rollout",
-]
+__all__ = ["Rollout", "SimulationConfig"]
+__all__ += ["object_maps", "render_clip", "simulate_clip", "simulate_dataset", "simulate_rollout"]

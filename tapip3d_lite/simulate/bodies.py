@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -9,7 +10,7 @@ import numpy as np
 
 from tapip3d_lite.simulate.meshes import MESHES
 from tapip3d_lite.simulate.settings import PRIMITIVES, SimulationConfig
-from tapip3d_lite.simulate.textures import Sky, Texture, random_sky, random_texture
+from tapip3d_lite.simulate.textures import Texture, random_sky, random_texture
 
 DOME_RADIUS = 11.0
 HIDDEN_GROUP = 1  # the backdrop's geom group: it is seen by the camera, but throws no shadow
@@ -32,26 +33,24 @@ class Body:
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """A compiled MuJoCo model with what MuJoCo does not know: starting velocities, textures and light.
+    """A compiled MuJoCo model with what MuJoCo does not know: starting velocities, textures and light."""
 
-    Attributes:
-        model: geoms in the order floor, (backdrop,) bodies.
-        bodies: in the order of the model's last geoms.
-        textures: one per geom.
-        sky: what lies where no geom is.
-        floor_mean: (3,) mean colour of the floor, which its far pattern fades to.
-        sun: (3,) unit vector towards the sun.
-        sun_color, ambient: (3,) linear RGB.
-    """
+    model: mujoco.MjModel  # geoms in the order floor, (backdrop,) bodies
+    bodies: tuple[Body, ...]  # in the order of the model's last geoms
+    textures: tuple[Texture, ...]  # one per geom
+    sky: Texture  # of directions: what lies where no geom is
+    floor_mean: np.ndarray  # (3,) mean colour of the floor, which its far pattern fades to
+    sun: np.ndarray  # (3,) unit vector towards the sun
+    sun_color: np.ndarray  # (3,) linear RGB
+    ambient: np.ndarray  # (3,) linear RGB
 
-    model: mujoco.MjModel
-    bodies: tuple[Body, ...]
-    textures: tuple[Texture, ...]
-    sky: Sky
-    floor_mean: np.ndarray
-    sun: np.ndarray
-    sun_color: np.ndarray
-    ambient: np.ndarray
+    def posed(self, states: np.ndarray) -> Iterator[mujoco.MjData]:
+        """Yield the world poses of all geoms at states (T, nq), each in the same object: use it before the next."""
+        data = mujoco.MjData(self.model)
+        for state in states:
+            data.qpos[:] = state
+            mujoco.mj_kinematics(self.model, data)
+            yield data
 
     @property
     def first_body(self) -> int:
@@ -81,7 +80,7 @@ def random_scene(rng: np.random.Generator, config: SimulationConfig, azimuth: fl
         bodies=tuple(bodies),
         textures=(*environment, *(body.texture for body in bodies)),
         sky=random_sky(rng),
-        floor_mean=floor.color(rng.uniform(-5, 5, (4096, 3)) * (1, 1, 0)).mean(0),
+        floor_mean=floor(rng.uniform(-5, 5, (4096, 3)) * (1, 1, 0)).mean(0),
         sun=sun,
         sun_color=np.float32(rng.uniform(0.75, 0.95) * np.array([1 + warmth, 1.0, 1 - warmth])),
         ambient=np.float32(rng.uniform(0.32, 0.45) * np.array([1 - warmth / 2, 1.0, 1 + warmth / 2])),
@@ -94,10 +93,12 @@ def _random_body(
     simple = [s for s in config.shapes if s in PRIMITIVES]  # half of the bodies, however many meshes there are
     kinds = simple if simple and rng.uniform() < 0.5 else config.shapes
     shape = kinds[rng.integers(len(kinds))]
-    half = rng.uniform(0.28, 0.55) * (1 if shape in MESHES else rng.uniform(0.65, 1, 3))
-    half = np.broadcast_to(half, 3)
+    half = rng.uniform(0.28, 0.55) * (np.ones(3) if shape in MESHES else rng.uniform(0.65, 1, 3))
     for _ in range(50):
-        position = _start(rng, config, moving, float(half.max()))
+        around = rng.uniform(0, 2 * np.pi)
+        distance = rng.uniform(0.4, 2.4) if moving else 2.0 * np.sqrt(rng.uniform())
+        height = half.max() + rng.uniform(0.2, 2.2) * config.drop if moving else half.max() * 1.05
+        position = np.array([np.cos(around) * distance, np.sin(around) * distance, height])
         reach = [np.linalg.norm(position - o.position) - 1.3 * (o.half.max() + half.max()) for o in others]
         if min(reach, default=1.0) > 0:
             break
@@ -112,13 +113,6 @@ def _random_body(
     return Body(shape, half, position, quaternion / np.linalg.norm(quaternion), velocity, spin, texture, moving)
 
 
-def _start(rng: np.random.Generator, config: SimulationConfig, moving: bool, radius: float) -> np.ndarray:
-    around = rng.uniform(0, 2 * np.pi)
-    distance = rng.uniform(0.4, 2.4) if moving else 2.0 * np.sqrt(rng.uniform())
-    height = radius + rng.uniform(0.2, 2.2) * config.drop if moving else radius * 1.05
-    return np.array([np.cos(around) * distance, np.sin(around) * distance, height])
-
-
 def _occluder(rng: np.random.Generator, azimuth: float) -> Body:
     half = np.array([0.15, rng.uniform(0.5, 0.7), rng.uniform(0.65, 0.85)])
     position = np.array([np.cos(azimuth) * 1.9, np.sin(azimuth) * 1.9, half[2]])
@@ -128,34 +122,31 @@ def _occluder(rng: np.random.Generator, azimuth: float) -> Body:
 
 
 def _compile(rng: np.random.Generator, config: SimulationConfig, bodies: list[Body]) -> mujoco.MjModel:
-    spec = mujoco.MjSpec()
+    spec, kinds = mujoco.MjSpec(), mujoco.mjtGeom
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     extent = 18 if config.sky else 0  # 0 is endless; under the sky the floor must end before depths become absurd
-    floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [extent, extent, 1]}
-    spec.worldbody.add_geom(**floor, friction=[0.7, 0.01, 0.003])
+    spec.worldbody.add_geom(type=kinds.mjGEOM_PLANE, size=[extent, extent, 1], friction=[0.7, 0.01, 0.003])
     if not config.sky:
-        dome = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [DOME_RADIUS] * 3, "contype": 0, "conaffinity": 0}
+        dome = {"type": kinds.mjGEOM_SPHERE, "size": [DOME_RADIUS] * 3, "contype": 0, "conaffinity": 0}
         spec.worldbody.add_geom(**dome, group=HIDDEN_GROUP)
-    for index, body in enumerate(bodies):
+    for body in bodies:
         node = spec.worldbody.add_body(pos=body.position, quat=body.quaternion)
         if not body.fixed:
             node.add_freejoint()
         solid = {"density": 400, "friction": [rng.uniform(0.3, 0.8), 0.01, 0.003]}
         # A short, underdamped contact: bodies bounce a little, as thrown toys do.
         solid["solref"] = [0.02, rng.uniform(0.25, 0.8)]
-        node.add_geom(**solid, **_geometry(rng, spec, body, index))
+        node.add_geom(**solid, **_geometry(rng, spec, body))
     return spec.compile()
 
 
-def _geometry(rng: np.random.Generator, spec: mujoco.MjSpec, body: Body, index: int) -> dict:
-    if body.shape in PRIMITIVES:
-        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{body.shape.upper()}")
-        half = body.half
-        if body.shape == "capsule":  # its second size is half the straight part
-            half = np.array([half.min() * 0.6, half.max() * 0.6, 0])
-        return {"type": kind, "size": half}
-    vertices, faces = MESHES[body.shape](rng)
-    mesh = spec.add_mesh(name=f"mesh{index}")
-    mesh.uservert = (vertices * body.half).ravel()
-    mesh.userface = np.asarray(faces).ravel()
-    return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": mesh.name}
+def _geometry(rng: np.random.Generator, spec: mujoco.MjSpec, body: Body) -> dict:
+    if body.shape in MESHES:
+        vertices, faces = MESHES[body.shape](rng)
+        mesh = spec.add_mesh(name=f"mesh{len(spec.meshes)}", uservert=(vertices * body.half).ravel())
+        mesh.userface = faces.ravel()
+        return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": mesh.name}
+    half = body.half
+    if body.shape == "capsule":  # its second size is half the straight part
+        half = np.array([half.min() * 0.6, half.max() * 0.6, 0])
+    return {"type": getattr(mujoco.mjtGeom, f"mjGEOM_{body.shape.upper()}"), "size": half}

@@ -12,41 +12,29 @@ from tapip3d_lite.simulate.settings import SimulationConfig
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A camera that looks at the action; evaluate it at any instant with `extrinsics`.
+    """A camera that looks at the action; evaluate it at any instant with `extrinsics`."""
 
-    Attributes:
-        intrinsics: (3, 3) pixels.
-        azimuth, elevation: (2,) radians, at the first and the last frame, of the arc around the origin.
-        distance: metres from the target.
-        target: (3,) the point that it looks at.
-        shift: (3,) metres that it travels along a line over the clip.
-        shake: (6, 3, 3) amplitude, angular frequency (1/s) and phase of three sine waves for each of the eye's
-            and the target's coordinates.
-        frames, fps: how long the clip is.
-    """
-
-    intrinsics: np.ndarray
-    azimuth: np.ndarray
-    elevation: np.ndarray
-    distance: float
-    target: np.ndarray
-    shift: np.ndarray
+    config: SimulationConfig
+    intrinsics: np.ndarray  # (3, 3) pixels
+    azimuth: np.ndarray  # (2,) radians, at the first and the last frame, of the arc around the target
+    elevation: np.ndarray  # (2,) likewise
+    distance: float  # metres from the target
+    target: np.ndarray  # (3,) the point that it looks at
+    shift: np.ndarray  # (3,) metres that it travels along a line over the clip
+    # (6, 3, 3) amplitude, angular frequency (1/s), phase of three sine waves for each of the eye's and target's axes
     shake: np.ndarray
-    frames: int
-    fps: float
 
     def extrinsics(self, instants: np.ndarray) -> np.ndarray:
         """World-to-camera poses (..., 4, 4) at instants (...,) counted in frames."""
         instants = np.asarray(instants, float)
-        share = (instants / max(self.frames - 1, 1))[..., None]
-        azimuth = self.azimuth[0] + share[..., 0] * (self.azimuth[1] - self.azimuth[0])
-        elevation = self.elevation[0] + share[..., 0] * (self.elevation[1] - self.elevation[0])
+        share = instants / max(self.config.frames - 1, 1)
+        azimuth, elevation = (first + share * (last - first) for first, last in (self.azimuth, self.elevation))
         flat = np.cos(elevation)
-        arm = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
+        arm = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)  # (..., 3)
         amplitude, frequency, phase = np.moveaxis(self.shake, 1, 0)
-        seconds = instants[..., None, None] / self.fps
-        wobble = (amplitude * np.sin(frequency * seconds + phase)).sum(-1)
-        eye = self.target + self.distance * arm + (share - 0.5) * self.shift + wobble[..., :3]
+        seconds = instants[..., None, None] / self.config.fps
+        wobble = (amplitude * np.sin(frequency * seconds + phase)).sum(-1)  # (..., 6)
+        eye = self.target + self.distance * arm + (share[..., None] - 0.5) * self.shift + wobble[..., :3]
         eye[..., 2] = np.maximum(eye[..., 2], 0.4)
         return look_at(eye, self.target + wobble[..., 3:], np.array([0.0, 0, 1]))
 
@@ -75,4 +63,4 @@ def random_path(rng: np.random.Generator, config: SimulationConfig) -> CameraPat
         shake[:, 2] = rng.uniform(0, 2 * np.pi, (6, 3))
     intrinsics = np.array([[pixels, 0, (width - 1) / 2], [0, pixels, (height - 1) / 2], [0, 0, 1]])
     target = np.array([*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.4, 0.8)])
-    return CameraPath(intrinsics, azimuth, elevation, distance, target, shift, shake, config.frames, config.fps)
+    return CameraPath(config, intrinsics, azimuth, elevation, distance, target, shift, shake)

@@ -65,10 +65,7 @@ def simulate_dataset(
 def run_jobs(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int | None = None) -> Iterator[Any]:
     """Yield a function's result for each job as it is done: in this process, or by several workers in any order.
 
-    Args:
-        function: at the top level of a module, since workers import it.
-        jobs: its arguments, one for each call.
-        workers: processes at most; None for one per core.
+    The function stands at the top level of a module, since workers import it. `workers=None` is one per core.
     """
     workers = min(workers or os.cpu_count() or 1, len(jobs))
     if workers > 1:
@@ -87,14 +84,13 @@ def _claim(folder: Path, config: SimulationConfig | Recipe) -> None:
     """Write the folder's description, or check that it is the same; delete half-written files."""
     path, description = folder / DESCRIPTION, _describe(config)
     if path.exists():
-        wanted = json.loads(json.dumps(description.get("simulation", description)))
         stored = _read(path)
-        different = [
-            f"{k}={stored.get(k)!r} (now {wanted.get(k)!r})" for k in stored | wanted if stored.get(k) != wanted.get(k)
-        ]
-        if different:
+        wanted = json.loads(json.dumps(description.get("simulation", description)))  # with lists for tuples
+        names = [name for name in stored | wanted if stored.get(name) != wanted.get(name)]
+        if names:
+            different = ", ".join(f"{name}={stored.get(name)!r} (now {wanted.get(name)!r})" for name in names)
             raise ValueError(
-                f"simulate_dataset: {path} describes clips of another configuration: {', '.join(different)}; "
+                f"simulate_dataset: {path} describes clips of another configuration: {different}; "
                 "use the same settings or another folder"
             )
     elif any(folder.glob("clip_*.npz")):

@@ -16,40 +16,38 @@ Mesh = tuple[np.ndarray, np.ndarray]
 def torus(rng: np.random.Generator) -> Mesh:
     """A ring of random thickness."""
     tube = rng.uniform(0.2, 0.36)
-    angle = np.linspace(0, 2 * np.pi, 28, endpoint=False)
-    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
-    return _sweep(ring * (1 - tube), np.full(len(angle), tube), 10)
+    return _sweep(_circle(28) * (1 - tube), tube, 10)
 
 
 def knot(rng: np.random.Generator) -> Mesh:
     """A closed pipe that winds up and down, like a crown."""
     waves, height = int(rng.integers(2, 5)), rng.uniform(0.2, 0.4)
-    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-    path = np.stack([0.75 * np.cos(angle), 0.75 * np.sin(angle), height * np.sin(waves * angle)], -1)
-    return _sweep(path, np.full(len(angle), 0.17), 7)
+    path = 0.75 * _circle(40)
+    path[:, 2] = height * np.sin(waves * np.linspace(0, 2 * np.pi, 40, endpoint=False))
+    return _sweep(path, 0.17, 7)
 
 
 def gear(rng: np.random.Generator) -> Mesh:
     """A cogwheel with 6 to 11 teeth."""
     teeth, depth = int(rng.integers(6, 12)), rng.uniform(0.7, 0.82)
     step = np.pi / teeth
-    corners = np.arange(2 * teeth)[:, None] * step + np.array([-0.32, 0.32]) * step
-    radius = np.where(np.arange(2 * teeth) % 2 == 0, 1.0, depth)[:, None] * np.ones(2)
-    return _extrude(_polar(corners.ravel(), radius.ravel()), rng.uniform(0.2, 0.35))
+    angle = np.arange(2 * teeth)[:, None] * step + np.array([-0.32, 0.32]) * step
+    radius = np.repeat(np.resize([1.0, depth], 2 * teeth), 2)
+    return _extrude(_polar(angle.ravel(), radius), rng.uniform(0.2, 0.35))
 
 
 def star(rng: np.random.Generator) -> Mesh:
     """A thick star with 4 to 7 points."""
     points = int(rng.integers(4, 8))
     angle = np.arange(2 * points) * np.pi / points
-    return _extrude(_polar(angle, np.where(np.arange(2 * points) % 2 == 0, 1.0, rng.uniform(0.45, 0.6))), 0.3)
+    return _extrude(_polar(angle, np.resize([1.0, rng.uniform(0.45, 0.6)], 2 * points)), 0.3)
 
 
 def bracket(rng: np.random.Generator) -> Mesh:
     """An L-shaped block."""
     w = rng.uniform(0.45, 0.7)
-    outline = np.array([[0, 0], [1.5, 0], [1.5, w], [w, w], [w, 1.5], [0, 1.5]])
-    return _extrude(outline - 0.6, rng.uniform(0.25, 0.45), hub=np.array([w / 2 - 0.6, w / 2 - 0.6]))
+    outline = np.array([[0, 0, 0], [1.5, 0, 0], [1.5, w, 0], [w, w, 0], [w, 1.5, 0], [0, 1.5, 0]])
+    return _extrude(outline - (0.6, 0.6, 0), rng.uniform(0.25, 0.45), hub=(w / 2 - 0.6, w / 2 - 0.6))
 
 
 def vase(rng: np.random.Generator) -> Mesh:
@@ -63,7 +61,7 @@ def vase(rng: np.random.Generator) -> Mesh:
 def blob(rng: np.random.Generator) -> Mesh:
     """A sphere with smooth random bumps."""
     height = np.cos(np.linspace(np.pi, 0, 17)[1:-1])
-    vertices, faces = _revolve(height, np.sqrt(1 - height**2), 20, poles=(-1.0, 1.0))
+    vertices, faces = _revolve(height, np.sqrt(1 - height**2), 20)
     waves, phases = rng.normal(size=(4, 3)) * 1.6, rng.uniform(0, 2 * np.pi, 4)
     bumps = 0.82 + 0.075 * np.sin(vertices @ waves.T + phases).sum(-1, keepdims=True)
     return _oriented(vertices * bumps, faces)
@@ -74,56 +72,52 @@ MESHES: dict[str, Callable[[np.random.Generator], Mesh]] = {
 }
 
 
-def _polar(angle: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
+def _polar(angle: np.ndarray, radius: np.ndarray | float) -> np.ndarray:
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], -1)
 
 
-def _rings_to_faces(rings: int, sides: int, closed: bool) -> np.ndarray:
-    """Two triangles for each cell of a (rings, sides) grid of vertices that wraps around its sides."""
-    i, j = np.meshgrid(np.arange(rings if closed else rings - 1), np.arange(sides), indexing="ij")
-    a, b = i * sides + j, i * sides + (j + 1) % sides
-    c, d = (i + 1) % rings * sides + j, (i + 1) % rings * sides + (j + 1) % sides
-    return np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
+def _circle(sides: int) -> np.ndarray:
+    return _polar(np.linspace(0, 2 * np.pi, sides, endpoint=False), 1.0)
 
 
-def _sweep(path: np.ndarray, radius: np.ndarray, sides: int) -> Mesh:
+def _sweep(path: np.ndarray, radius: float, sides: int) -> Mesh:
     """A tube along a closed path (P, 3) that circles the z axis."""
     tangent = np.roll(path, -1, 0) - np.roll(path, 1, 0)
     tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
     outward = path * (1, 1, 0)
     outward -= (outward * tangent).sum(-1, keepdims=True) * tangent
     outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
-    side = np.cross(tangent, outward)
-    angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None, :, None]
-    circle = np.cos(angle) * outward[:, None] + np.sin(angle) * side[:, None]
-    vertices = path[:, None] + radius[:, None, None] * circle
-    return _oriented(vertices.reshape(-1, 3), _rings_to_faces(len(path), sides, closed=True))
+    across, along, _ = _circle(sides).T[..., None]  # (S, 1)
+    rim = across * outward[:, None] + along * np.cross(tangent, outward)[:, None]  # (P, S, 3)
+    return _skin(path[:, None] + radius * rim)
 
 
-def _revolve(height: np.ndarray, radius: np.ndarray, sides: int, poles: tuple[float, float] | None = None) -> Mesh:
-    """A profile turned around the z axis and closed by one vertex at each end."""
-    angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
-    rings = radius[:, None, None] * circle + height[:, None, None] * np.array([0, 0, 1])
-    low, high = poles or (height[0], height[-1])
-    vertices = np.concatenate([rings.reshape(-1, 3), [[0, 0, low], [0, 0, high]]])
-    j, last = np.arange(sides), (len(height) - 1) * sides
-    bottom = np.stack([(j + 1) % sides, j, np.full(sides, len(vertices) - 2)], -1)
-    top = np.stack([last + j, last + (j + 1) % sides, np.full(sides, len(vertices) - 1)], -1)
-    return _oriented(vertices, np.concatenate([_rings_to_faces(len(height), sides, closed=False), bottom, top]))
+def _revolve(height: np.ndarray, radius: np.ndarray, sides: int) -> Mesh:
+    """A profile (R,) turned around the z axis and closed by the vertices z = -1 and z = 1."""
+    rings = radius[:, None, None] * _circle(sides)
+    rings[..., 2] = height[:, None]
+    return _skin(rings, [[0, 0, -1], [0, 0, 1]])
 
 
-def _extrude(outline: np.ndarray, half: float, hub: np.ndarray | None = None) -> Mesh:
-    """An outline (P, 2), star-shaped around `hub`, pulled to a thickness of 2 * half."""
-    count = len(outline)
-    flat = np.concatenate([outline, outline])
-    vertices = np.concatenate([flat, np.repeat([[-half], [half]], count, 0)], -1)
-    centre = np.zeros(2) if hub is None else hub
-    vertices = np.concatenate([vertices, [[*centre, -half], [*centre, half]]])
-    j, k = np.arange(count), (np.arange(count) + 1) % count
-    bottom = np.stack([k, j, np.full(count, 2 * count)], -1)
-    top = np.stack([count + j, count + k, np.full(count, 2 * count + 1)], -1)
-    return _oriented(vertices, np.concatenate([_rings_to_faces(2, count, closed=False), bottom, top]))
+def _extrude(outline: np.ndarray, half: float, hub: tuple[float, float] = (0.0, 0.0)) -> Mesh:
+    """An outline (P, 3) at z = 0, star-shaped around `hub`, pulled to a thickness of 2 * half."""
+    rings = np.stack([outline - (0, 0, half), outline + (0, 0, half)])
+    return _skin(rings, [[*hub, -half], [*hub, half]])
+
+
+def _skin(rings: np.ndarray, poles: list[list[float]] | None = None) -> Mesh:
+    """A mesh over rings (R, S, 3) of vertices: a whole torus, or closed by a vertex at each end."""
+    index = np.arange(rings.shape[0] * rings.shape[1]).reshape(rings.shape[:2])
+    beside, above = np.roll(index, -1, 1), np.roll(index, -1, 0)
+    across = np.roll(above, -1, 1)
+    cells = np.stack([[index, beside, across], [index, across, above]]).transpose(0, 2, 3, 1)  # (2, R, S, 3)
+    vertices = rings.reshape(-1, 3)
+    if poles is None:
+        return _oriented(vertices, cells.reshape(-1, 3))
+    low, high = (np.full(index.shape[1], index.size + end) for end in range(2))
+    ends = np.stack([beside[0], index[0], low], -1), np.stack([index[-1], beside[-1], high], -1)
+    sides = cells[:, :-1].reshape(-1, 3)  # nothing from the last ring to the first
+    return _oriented(np.concatenate([vertices, poles]), np.concatenate([sides, *ends]))
 
 
 def _oriented(vertices: np.ndarray, faces: np.ndarray) -> Mesh:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 Pattern = Callable[[np.ndarray], np.ndarray]
 
@@ -17,8 +18,8 @@ _SOFT = 0.03  # width of an edge, units
 _TABLE = 1024  # entries of a colour table
 
 
-def waves(rng: np.random.Generator, count: int, length: float) -> Pattern:
-    """A smooth random field of about unit variance: plane waves of about one length, in random directions."""
+def smooth_field(rng: np.random.Generator, count: int, length: float) -> Pattern:
+    """A random field (P,) of about unit variance: plane waves of about one length, in random directions."""
     directions = rng.normal(size=(3, count))
     directions *= 2 * np.pi / (length * rng.uniform(0.75, 1.35, count) * np.linalg.norm(directions, axis=0))
     directions = directions.astype(np.float32)
@@ -27,22 +28,19 @@ def waves(rng: np.random.Generator, count: int, length: float) -> Pattern:
     return lambda p: np.sin(p @ directions + phases) @ weights
 
 
-def _bands(rng: np.random.Generator, colors: np.ndarray, shares: np.ndarray, soft: float) -> np.ndarray:
-    """A periodic colour table (1024, 3): bands of the given shares, edges blurred by `soft` periods."""
+def _bands(rng: np.random.Generator, colors: np.ndarray, shares: ArrayLike, soft: float) -> Pattern:
+    """Colours of positions (P,) along periodic bands of the given shares, edges blurred by `soft` periods."""
     edges = np.cumsum(shares) / np.sum(shares)
     hard = colors[np.searchsorted(edges, (np.arange(_TABLE) + 0.5) / _TABLE)]
     blur = np.exp(-2 * (np.pi * 0.4 * soft * np.fft.rfftfreq(_TABLE, 1 / _TABLE)) ** 2)
     smooth = np.fft.irfft(np.fft.rfft(hard, axis=0) * blur[:, None], _TABLE, axis=0)
-    return np.roll(smooth, rng.integers(_TABLE), axis=0).astype(np.float32)
-
-
-def _lookup(table: np.ndarray, s: np.ndarray) -> np.ndarray:
-    return table[np.floor(s * np.float32(_TABLE)).astype(np.int32) & (_TABLE - 1)]
+    table = np.roll(smooth, rng.integers(_TABLE), axis=0).astype(np.float32)
+    return lambda s: table[np.floor(s * _TABLE).astype(np.int32) & (_TABLE - 1)]
 
 
 def smooth_step(distance: np.ndarray, soft: float = _SOFT) -> np.ndarray:
     """0 below zero, 1 above, smooth in between over `soft`."""
-    t = np.clip(distance * np.float32(1 / soft) + np.float32(0.5), 0, 1)
+    t = np.clip(distance * (1 / soft) + 0.5, 0, 1)
     return t * t * (3 - 2 * t)
 
 
@@ -61,29 +59,24 @@ def _cells(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _checker(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     size = rng.uniform(0.2, 0.34)
     steep = size / (np.pi * 0.5 * _SOFT)
-
-    def pattern(p: np.ndarray) -> np.ndarray:
-        side = np.clip(np.cos(p * np.float32(np.pi / size)) * np.float32(steep), -1, 1)
-        return mix(colors[0], colors[1], 0.5 + 0.5 * side[:, 0] * side[:, 1] * side[:, 2])
-
-    return pattern
+    return lambda p: mix(*colors[:2], 0.5 + 0.5 * np.clip(np.cos(p * (np.pi / size)) * steep, -1, 1).prod(1))
 
 
 def _stripes(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     period = rng.uniform(0.5, 0.8)
-    table = _bands(rng, colors[[0, 1, 0, 2]], rng.uniform(0.5, 1.2, 4), _SOFT / period)
+    bands = _bands(rng, colors[[0, 1, 0, 2]], rng.uniform(0.5, 1.2, 4), _SOFT / period)
     along = rng.normal(size=3) * (1, 1, 0.4)
     along = (along / np.linalg.norm(along) / period).astype(np.float32)
-    return lambda p: _lookup(table, p @ along)
+    return lambda p: bands(p @ along)
 
 
-def _waved(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
+def _waves(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     period, length, height = rng.uniform(0.4, 0.6), rng.uniform(0.4, 0.6), rng.uniform(0.07, 0.12)
-    table = _bands(rng, colors[:4], rng.uniform(0.6, 1.2, 4), 1.3 * _SOFT / period)
+    bands = _bands(rng, colors[:4], rng.uniform(0.6, 1.2, 4), 1.3 * _SOFT / period)
 
     def pattern(p: np.ndarray) -> np.ndarray:
-        wave = np.sin((p[:, 0] + p[:, 2]) * np.float32(2 * np.pi / length))
-        return _lookup(table, (p[:, 1] + 0.3 * p[:, 2] + np.float32(height) * wave) * np.float32(1 / period))
+        wave = np.sin((p[:, 0] + p[:, 2]) * (2 * np.pi / length))
+        return bands((p[:, 1] + 0.3 * p[:, 2] + height * wave) * (1 / period))
 
     return pattern
 
@@ -98,7 +91,7 @@ def _bricks(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
         q = p / size
         q[:, 0] += shift * (np.rint(q[:, 1]) + np.rint(q[:, 2]))
         q, key = _cells(q)
-        inside = ((0.5 - np.abs(q)) * size).min(-1) - np.float32(joint)
+        inside = ((0.5 - np.abs(q)) * size).min(-1) - joint
         return mix(colors[0], faces[key], smooth_step(inside, 0.8 * _SOFT))
 
     return pattern
@@ -113,9 +106,9 @@ def _dots(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     paint = colors[1 + rng.integers(0, min(3, len(colors) - 1), 256)]
 
     def pattern(p: np.ndarray) -> np.ndarray:
-        q, key = _cells(p * np.float32(1 / size))
+        q, key = _cells(p * (1 / size))
         q -= centres[key]
-        distance = (reach[key] - np.sqrt(np.einsum("pi,pi->p", q, q))) * np.float32(size)
+        distance = (reach[key] - np.sqrt(np.einsum("pi,pi->p", q, q))) * size
         return mix(colors[0], paint[key], smooth_step(distance))
 
     return pattern
@@ -131,9 +124,9 @@ def _terrazzo(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     def pattern(p: np.ndarray) -> np.ndarray:
         color = np.broadcast_to(colors[0], p.shape)
         for size in sizes:
-            q, key = _cells(p * np.float32(1 / size) + np.float32(7 * size))
+            q, key = _cells(p * (1 / size) + 7 * size)
             out = 1 - np.abs(np.einsum("pi,pij->pj", q, shapes[key])).max(-1)
-            color = mix(color, paint[key], smooth_step(out * np.float32(0.2 * size), 0.7 * _SOFT))
+            color = mix(color, paint[key], smooth_step(out * (0.2 * size), 0.7 * _SOFT))
         return color
 
     return pattern
@@ -141,76 +134,52 @@ def _terrazzo(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
 
 def _marble(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     period = rng.uniform(0.45, 0.7)
-    table = _bands(rng, colors[[0, 2, 0, 1, 0, 3]], np.array([3, 1.2, 2, 0.7, 3, 1.0]), 1.6 * _SOFT / period)
-    wide, narrow = waves(rng, 5, 0.8), waves(rng, 6, 0.33)
-
-    def pattern(p: np.ndarray) -> np.ndarray:
-        warp = np.float32(0.2) * wide(p) + np.float32(0.05) * narrow(p)
-        return _lookup(
-            table, (p[:, 0] + np.float32(0.4) * p[:, 2] + warp * np.float32(period)) * np.float32(1 / period)
-        )
-
-    return pattern
+    bands = _bands(rng, colors[[0, 2, 0, 1, 0, 3]], [3, 1.2, 2, 0.7, 3, 1.0], 1.6 * _SOFT / period)
+    wide, narrow = smooth_field(rng, 5, 0.8), smooth_field(rng, 6, 0.33)
+    return lambda p: bands((p[:, 0] + 0.4 * p[:, 2] + (0.2 * wide(p) + 0.05 * narrow(p)) * period) * (1 / period))
 
 
 def _wood(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     period = rng.uniform(0.3, 0.45)
-    shares = rng.uniform(0.5, 1.5, 6)
-    table = _bands(rng, colors[[0, 1, 2, 0, 3, 2]], shares, 1.5 * _SOFT / period)
-    axis, warp = rng.uniform(0.15, 0.5, 2).astype(np.float32), waves(rng, 5, 1.0)
+    bands = _bands(rng, colors[[0, 1, 2, 0, 3, 2]], rng.uniform(0.5, 1.5, 6), 1.5 * _SOFT / period)
+    axis, warp = rng.uniform(0.15, 0.5, 2).astype(np.float32), smooth_field(rng, 5, 1.0)
     stretch = np.array([0.35, 1, 1], np.float32)  # the grain runs along x
 
     def pattern(p: np.ndarray) -> np.ndarray:
-        radius = np.sqrt((p[:, 1] - axis[0]) ** 2 + (p[:, 2] - axis[1]) ** 2 + np.float32(1e-3))
-        return _lookup(table, (radius + np.float32(0.06) * warp(p * stretch)) * np.float32(1 / period))
+        radius = np.sqrt((p[:, 1] - axis[0]) ** 2 + (p[:, 2] - axis[1]) ** 2 + 1e-3)
+        return bands((radius + 0.06 * warp(p * stretch)) * (1 / period))
 
     return pattern
 
 
 def _patches(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     length = rng.uniform(0.45, 0.65)
-    wide, narrow = waves(rng, 8, length), waves(rng, 8, 0.4 * length)
-    table = _bands(rng, colors[:4], np.array([1.0, 0.8, 0.9, 0.8]), 1.6 * _SOFT / length)
-    return lambda p: _lookup(table, np.float32(0.25) * wide(p) + np.float32(0.07) * narrow(p))
+    wide, narrow = smooth_field(rng, 8, length), smooth_field(rng, 8, 0.4 * length)
+    bands = _bands(rng, colors[:4], [1.0, 0.8, 0.9, 0.8], 1.6 * _SOFT / length)
+    return lambda p: bands(0.25 * wide(p) + 0.07 * narrow(p))
 
 
 def _speckle(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     along = (rng.normal(size=3) * (0.5, 0.5, 0.3)).astype(np.float32)
-    table = _bands(rng, colors[:3], np.ones(3), 0.5)
-    specks = _dots(rng, np.stack([colors[0], colors[-1], colors[0], colors[-1]]))
+    bands = _bands(rng, colors[:3], [1, 1, 1], 0.5)
+    specks = _dots(rng, colors[[0, -1, 0, -1]])
 
     def pattern(p: np.ndarray) -> np.ndarray:
-        base = _lookup(table, p @ along)
-        return base + np.float32(0.55) * (specks(p * np.float32(1.9)) - base) * np.float32(0.9)
+        base = bands(p @ along)
+        return base + 0.55 * (specks(p * 1.9) - base) * 0.9
 
     return pattern
 
 
 def _plaid(rng: np.random.Generator, colors: np.ndarray) -> Pattern:
     period = rng.uniform(0.45, 0.65)
-    tables = [
-        _bands(rng, colors[[0, 1, 0, 2]], np.array([1.2, 0.9, 1.0, rng.uniform(0.2, 0.4)]), _SOFT / period)
-        for _ in range(3)
-    ]
+    colors = colors[[0, 1, 0, 2]]
+    axes = [_bands(rng, colors, [1.2, 0.9, 1.0, rng.uniform(0.2, 0.4)], _SOFT / period) for _ in range(3)]
     weights = np.array([0.42, 0.38, 0.2], np.float32)
-
-    def pattern(p: np.ndarray) -> np.ndarray:
-        q = p * np.float32(1 / period)
-        return sum(_lookup(table, q[:, i]) * weights[i] for i, table in enumerate(tables))
-
-    return pattern
+    return lambda p: sum(bands(p[:, i] * (1 / period)) * weights[i] for i, bands in enumerate(axes))
 
 
 PATTERNS: dict[str, Callable[[np.random.Generator, np.ndarray], Pattern]] = {
-    "checker": _checker,
-    "stripes": _stripes,
-    "waves": _waved,
-    "bricks": _bricks,
-    "dots": _dots,
-    "terrazzo": _terrazzo,
-    "marble": _marble,
-    "wood": _wood,
-    "patches": _patches,
-    "speckle": _speckle,
-    "plaid": _plaid,
+    f.__name__.removeprefix("_"): f
+    for f in (_checker, _stripes, _waves, _bricks, _dots, _terrazzo, _marble, _wood, _patches, _speckle, _plaid)
 }

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from tapip3d_lite.geometry import invert
 from tapip3d_lite.simulate.bodies import HIDDEN_GROUP, SimulatedScene
+from tapip3d_lite.simulate.rollout import Rollout
 
 SUN_DISTANCE = 30.0
 SUN_RADIUS = 0.8  # metres at that distance: penumbras about as wide as on a lightly clouded day
@@ -22,26 +24,75 @@ _TONES = np.rint(255 * np.linspace(0, 1, 4096) ** (1 / 2.2)).astype(np.uint8)
 
 
 @dataclass(frozen=True)
+class Shots:
+    """A rollout at its frames' own instants, and what rays through the pixels' centres meet there."""
+
+    scene: SimulatedScene
+    states: np.ndarray  # (T, nq)
+    intrinsics: np.ndarray  # (3, 3)
+    extrinsics: np.ndarray  # (T, 4, 4)
+    poses: np.ndarray  # (T, G, 4, 4) of all geoms, local to world
+    depths: np.ndarray  # (T, H, W) z-depth, 0 for the sky
+    geom: np.ndarray  # (T, H, W) geom index, -1 for the sky
+    normal: np.ndarray  # (T, H, W, 3) of the side that is seen, world frame
+
+
+def shoot(scene: SimulatedScene, rollout: Rollout) -> Shots:
+    """Cast the rays of all pixels' centres in all frames."""
+    size, center = rollout.config.size, rollout.states.shape[1] // 2
+    states, intrinsics = rollout.states[:, center], rollout.intrinsics.astype(float)
+    extrinsics = rollout.extrinsics[:, center].astype(float)
+    rays = pixel_rays(intrinsics, np.arange(size[1]), np.arange(size[0]))
+    poses = np.tile(np.eye(4), (len(states), scene.model.ngeom, 1, 1))
+    depths, geom = np.empty((len(states), *size)), np.empty((len(states), *size), np.int32)
+    normal = np.empty((*depths.shape, 3))
+    for t, data in enumerate(scene.posed(states)):
+        poses[t, :, :3, :3] = data.geom_xmat.reshape(-1, 3, 3)
+        poses[t, :, :3, 3] = data.geom_xpos
+        hits = cast(data, invert(extrinsics[t])[:3, 3], rays @ extrinsics[t, :3, :3])
+        depths[t] = np.where(hits.geom < 0, 0, hits.distance * rays[:, 2]).reshape(size)
+        geom[t], normal[t] = hits.geom.reshape(size), hits.normal.reshape(*size, 3)
+    return Shots(scene, states, intrinsics, extrinsics, poses, depths, geom, normal)
+
+
+def film(scene: SimulatedScene, rollout: Rollout, extrinsics: np.ndarray) -> np.ndarray:
+    """The video (T, H, W, 3) uint8 of cameras (T, S, 4, 4); light is averaged over the S instants of a frame."""
+    intrinsics, shape = rollout.intrinsics.astype(float), tuple(side + 1 for side in rollout.config.size)
+    corners = pixel_rays(intrinsics, np.arange(shape[1]) - 0.5, np.arange(shape[0]) - 0.5)
+    pixel = 1 / intrinsics[0, 0]  # its size at distance 1
+    video = []
+    for states, poses in zip(rollout.states, extrinsics, strict=True):
+        instants = zip(scene.posed(states), poses, strict=True)
+        light = sum(_color(scene, data, corners, pose, pixel, shape) for data, pose in instants)
+        video.append(_TONES[np.clip(light / len(states) * 4095 + 0.5, 0, 4095).astype(np.int16)])
+    return np.stack(video)
+
+
+@dataclass(frozen=True)
 class Hits:
-    """What rays have hit: distance (R,) with inf for the sky, geom (R,) with -1 for the sky, normal (R, 3) outward."""
+    """What unit rays from one point have hit first, in the world frame."""
 
-    distance: np.ndarray
-    geom: np.ndarray
-    normal: np.ndarray
+    rays: np.ndarray  # (R, 3)
+    distance: np.ndarray  # (R,) inf for the sky
+    geom: np.ndarray  # (R,) -1 for the sky
+    points: np.ndarray  # (R, 3) at distance 1 for the sky
+    normal: np.ndarray  # (R, 3) of the side that is seen
 
 
-def cast(
-    model: mujoco.MjModel, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray, shadow: bool = False
-) -> Hits:
+def cast(data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray, shadow: bool = False) -> Hits:
     """First hits of unit rays (R, 3) from one origin (3,), in the world; `shadow` leaves out the backdrop."""
     count = len(rays)
-    distance, geom, normal = np.empty(count), np.empty(count, np.int32), np.empty(3 * count)
+    distance, geom, normal = np.empty(count), np.empty(count, np.int32), np.empty((count, 3))
     groups = np.ones(6, np.uint8)
     groups[HIDDEN_GROUP] = not shadow
-    rays = np.ascontiguousarray(rays, np.float64).reshape(-1)
+    rays = np.ascontiguousarray(rays, np.float64)
     if count:
-        mujoco.mj_multiRay(model, data, origin, rays, groups, True, -1, geom, distance, normal, count, 1e10)
-    return Hits(np.where(geom < 0, np.inf, distance), geom, normal.reshape(-1, 3))
+        flat, normals = rays.reshape(-1), normal.reshape(-1)
+        mujoco.mj_multiRay(data.model, data, origin, flat, groups, True, -1, geom, distance, normals, count, 1e10)
+    points = origin + rays * np.where(geom < 0, 1, distance)[:, None]
+    inside = np.einsum("rc,rc->r", normal, rays) > 0  # the backdrop, a sphere around the camera
+    normal *= np.where(inside, -1, 1)[:, None]
+    return Hits(rays, np.where(geom < 0, np.inf, distance), geom, points, normal)
 
 
 def pixel_rays(intrinsics: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -51,117 +102,65 @@ def pixel_rays(intrinsics: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarr
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-def camera_center(extrinsics: np.ndarray) -> np.ndarray:
-    """The camera's position (3,) in the world."""
-    return -extrinsics[:3, :3].T @ extrinsics[:3, 3]
-
-
-def render_depth(
-    scene: SimulatedScene, data: mujoco.MjData, rays: np.ndarray, extrinsics: np.ndarray
-) -> tuple[np.ndarray, Hits]:
-    """z-depths (R,) along camera-frame rays (R, 3), 0 where the sky is, and the hits."""
-    hits = cast(scene.model, data, camera_center(extrinsics), rays @ extrinsics[:3, :3])
-    return np.where(hits.geom < 0, 0, hits.distance * rays[:, 2]), hits
-
-
-def render_color(
-    scene: SimulatedScene,
-    data: mujoco.MjData,
-    rays: np.ndarray,
-    extrinsics: np.ndarray,
-    size: tuple[int, int],
-    pixel: float,
+def _color(
+    scene: SimulatedScene, data: mujoco.MjData, rays: np.ndarray, pose: np.ndarray, pixel: float, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Linear RGB (H, W, 3) float32.
-
-    Args:
-        rays: ((H + 1) * (W + 1), 3) camera-frame unit rays through the pixels' corners.
-        extrinsics: (4, 4).
-        size: (H, W).
-        pixel: size of a pixel at distance 1.
-    """
-    shape = size[0] + 1, size[1] + 1
-    origin, rays = camera_center(extrinsics), rays @ extrinsics[:3, :3]
-    hits = cast(scene.model, data, origin, rays)
-    points = origin + rays * np.where(hits.geom < 0, 1, hits.distance)[:, None]
-    steepness = np.einsum("rc,rc->r", hits.normal, rays)
-    normal = hits.normal * -np.sign(steepness)[:, None]  # the backdrop is seen from inside
-    sunlight = np.maximum(normal @ scene.sun, 0).astype(np.float32)
-    sunlight[(hits.geom < 0) | scene.is_backdrop(hits.geom)] = 0
-    footprint = pixel * hits.distance / np.maximum(np.abs(steepness), 0.2)
-    sunlight *= _sunlit(scene, data, points, hits.geom, sunlight > 0, shape)
-    color = _shade(scene, data, points, normal, rays, hits.geom, sunlight, footprint).reshape(*shape, 3)
+    """Linear RGB (H, W, 3) float32 of a camera's pose (4, 4), from rays through the pixels' corners, a grid of `shape`."""
+    hits = cast(data, invert(pose)[:3, 3], rays @ pose[:3, :3])
+    color = _shade(scene, data, hits, _sunlight(scene, data, hits, shape), pixel).reshape(*shape, 3)
     rows = color[1:] + color[:-1]
     return (rows[:, 1:] + rows[:, :-1]) / 4
 
 
-def to_bytes(linear: np.ndarray) -> np.ndarray:
-    """Linear RGB in [0, 1] to display values uint8."""
-    return _TONES[np.clip(linear * 4095 + 0.5, 0, 4095).astype(np.int16)]
-
-
-def _shade(
-    scene: SimulatedScene,
-    data: mujoco.MjData,
-    points: np.ndarray,
-    normal: np.ndarray,
-    rays: np.ndarray,
-    geom: np.ndarray,
-    sunlight: np.ndarray,
-    footprint: np.ndarray,
-) -> np.ndarray:
+def _shade(scene: SimulatedScene, data: mujoco.MjData, hits: Hits, sunlight: np.ndarray, pixel: float) -> np.ndarray:
     """Linear RGB (R, 3): texture times (ambient, brighter from above, + sun), and a faint highlight on bodies."""
-    color = np.empty((len(points), 3), np.float32)
-    order = np.argsort(geom.astype(np.int16), kind="stable")  # 16 bits: a radix sort
-    starts = np.searchsorted(geom[order], np.arange(-1, scene.model.ngeom + 1))
-    for index in range(-1, scene.model.ngeom):
-        at = order[starts[index + 1] : starts[index + 2]]
-        if not len(at):
-            continue
+    color = np.empty((len(hits.geom), 3), np.float32)
+    for index in np.unique(hits.geom):
+        at = np.flatnonzero(hits.geom == index)
         if index < 0:
-            color[at] = scene.sky.color(rays[at])
+            color[at] = scene.sky(hits.rays[at])
             continue
-        local = (points[at] - data.geom_xpos[index]) @ data.geom_xmat[index].reshape(3, 3)
-        paint = scene.textures[index].color(local)
+        local = (hits.points[at] - data.geom_xpos[index]) @ data.geom_xmat[index].reshape(3, 3)
+        paint = scene.textures[index](local)
         if scene.is_backdrop(index):
             color[at] = BACKDROP_GLOW * paint
             continue
         if index == 0:  # where a pixel covers more floor than the pattern's features, only its mean is left
-            fade = np.clip((footprint[at] - 0.15) / 0.4, 0, 1).astype(np.float32)
+            footprint = pixel * hits.distance[at] / np.maximum(np.abs(hits.rays[at, 2]), 0.2)
+            fade = np.clip((footprint - 0.15) / 0.4, 0, 1).astype(np.float32)
             paint += fade[:, None] * (scene.floor_mean - paint)
-        upward = (0.7 + 0.3 * normal[at, 2:]).astype(np.float32)
+        upward = (0.7 + 0.3 * hits.normal[at, 2:]).astype(np.float32)
         paint *= upward * scene.ambient + sunlight[at, None] * scene.sun_color
         if index:
-            halfway = scene.sun - rays[at]
-            shine = np.einsum("rc,rc->r", normal[at], halfway) / np.linalg.norm(halfway, axis=-1)
+            halfway = scene.sun - hits.rays[at]
+            shine = np.einsum("rc,rc->r", hits.normal[at], halfway) / np.linalg.norm(halfway, axis=-1)
             paint += (0.18 * (sunlight[at] > 0) * np.maximum(shine, 0) ** 32).astype(np.float32)[:, None]
         color[at] = paint
     return color
 
 
-def _sunlit(
-    scene: SimulatedScene,
-    data: mujoco.MjData,
-    points: np.ndarray,
-    geom: np.ndarray,
-    asked: np.ndarray,
-    shape: tuple[int, int],
-) -> np.ndarray:
-    """The visible share of the sun (R,) float32 at points on a grid of `shape`; only where `asked`, else 1."""
+def _sunlight(scene: SimulatedScene, data: mujoco.MjData, hits: Hits, shape: tuple[int, int]) -> np.ndarray:
+    """How brightly the sun lights the hits (R,) float32, a grid of `shape`: cosine times the sun's visible share."""
+    sunlight = np.maximum(hits.normal @ scene.sun, 0).astype(np.float32)
+    sunlight[(hits.geom < 0) | scene.is_backdrop(hits.geom)] = 0
     rows, columns = np.indices(shape).reshape(2, -1)
     # Numbered along the diagonals, so that each 2x2 block of the checkerboard's fields looks at all four points.
     index = (rows + columns) // 2 % 2 * 2 + (rows - columns) // 2 % 2
     fields = (rows + columns) % 2 == 0
-    lit = np.ones(len(points), np.float32)
-    for number, position in enumerate(_sun_points(scene.sun)):
-        chosen = np.flatnonzero((index == number) & fields & asked)
-        towards = points[chosen] - position
+    lit = np.ones(len(sunlight), bool)
+    side = np.cross(scene.sun, [0.0, 0, 1])
+    side *= SUN_RADIUS / np.linalg.norm(side)
+    other = np.cross(scene.sun, side)
+    for number, offset in enumerate((side, other, -other, -side)):  # around the sun's disc
+        position = SUN_DISTANCE * scene.sun + offset
+        chosen = np.flatnonzero((index == number) & fields & (sunlight > 0))
+        towards = hits.points[chosen] - position
         distance = np.sqrt(np.einsum("rc,rc->r", towards, towards))
         towards /= distance[:, None]
         near = _may_hit(scene, data, position, towards)
-        hits = cast(scene.model, data, position, towards[near], shadow=True)
-        lit[chosen[near]] = hits.distance > distance[near] - 0.01
-    return _mean_same_geom(lit.reshape(shape), geom.reshape(shape), fields.reshape(shape)).ravel()
+        shadows = cast(data, position, towards[near], shadow=True)
+        lit[chosen[near]] = shadows.distance > distance[near] - 0.01
+    return sunlight * _mean_same_geom(*(a.reshape(shape) for a in (lit, hits.geom, fields))).ravel()
 
 
 def _may_hit(scene: SimulatedScene, data: mujoco.MjData, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
@@ -172,23 +171,13 @@ def _may_hit(scene: SimulatedScene, data: mujoco.MjData, origin: np.ndarray, ray
     return (rays @ (center / distance[:, None]).T > least).any(1)
 
 
-def _sun_points(sun: np.ndarray) -> np.ndarray:
-    """Four points (4, 3) around the sun's disc."""
-    side = np.cross(sun, [0.0, 0, 1])
-    side *= SUN_RADIUS / np.linalg.norm(side)
-    other = np.cross(sun, side)
-    return SUN_DISTANCE * sun + np.stack([side, other, -other, -side])
-
-
-def _mean_same_geom(value: np.ndarray, geom: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """3x3 mean of the `known` values over the neighbours on the same geom; 1 where there are none."""
-    value, known = np.pad(value * known, 1), np.pad(known.astype(np.float32), 1)
-    same = np.pad(geom, 1, constant_values=-2)
+def _mean_same_geom(lit: np.ndarray, geom: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """3x3 mean (H, W) of `lit` over the known neighbours on the same geom; 1 where there are none."""
+    lit, known, geoms = np.pad(lit & known, 1), np.pad(known, 1), np.pad(geom, 1, constant_values=-2)
     total, count = np.zeros(geom.shape, np.float32), np.zeros(geom.shape, np.float32)
-    for row in range(3):
-        for column in range(3):
-            window = slice(row, row + geom.shape[0]), slice(column, column + geom.shape[1])
-            match = same[window] == geom
-            total += value[window] * match
-            count += known[window] * match
+    for row, column in np.ndindex(3, 3):
+        window = slice(row, row + geom.shape[0]), slice(column, column + geom.shape[1])
+        same = geoms[window] == geom
+        total += lit[window] & same
+        count += known[window] & same
     return np.where(count > 0, total / np.maximum(count, 1), 1)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -61,44 +63,35 @@ class SimulationConfig:
     share_dynamic: float = 0.6
 
     def __post_init__(self) -> None:
-        for name in ("size", "arc", "moving", "resting", "shapes"):
-            value = getattr(self, name)
-            _require(isinstance(value, (tuple, list)), name, "a tuple", value, "e.g. size=(128, 128)")
-            object.__setattr__(self, name, tuple(value))  # lists come from JSON and from the command line
-        self._check_numbers()
-        for name, low in (("size", 8), ("moving", 1), ("resting", 0)):
-            _check_integers(name, getattr(self, name), low)
-        for name in ("arc", "moving", "resting"):
-            pair = getattr(self, name)
-            _require(len(pair) == 2 and pair[0] <= pair[1], name, "(least, greatest)", pair, "put the smaller first")
-        _require(self.moving[1] + self.resting[1] <= 40, "moving + resting", "at most 40", self.moving, "lower them")
-        _require(self.camera in CAMERAS, "camera", f"one of {', '.join(CAMERAS)}", self.camera, "choose one of them")
+        tuples = "size arc moving resting shapes"
+        self._require(tuples, lambda v: isinstance(v, (tuple, list)), "a tuple", "e.g. size=(128, 128)")
+        for name in tuples.split():
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # lists come from JSON and the command line
+        self._require("frames tracks", lambda v: _whole(1, v), "a whole number of at least 1", "change it")
+        self._require("size", lambda v: len(v) == 2 and _whole(8, *v), "two whole numbers of at least 8", "change it")
+        self._require("moving", lambda v: len(v) == 2 and _whole(1, *v), "two whole numbers of at least 1", "change it")
+        self._require(
+            "resting", lambda v: len(v) == 2 and _whole(0, *v), "two whole numbers of at least 0", "change it"
+        )
+        self._require("arc moving resting", lambda v: len(v) == 2 and v[0] <= v[1], "(least, greatest)", "sort them")
+        self._require("resting", lambda v: v[1] + self.moving[1] <= 40, "at most 40 with the moving", "lower both")
+        self._require("fps speed drop", lambda v: _number(v) and v > 0, "a positive number", "1 is the usual scale")
+        self._require("handheld stereo_baseline", lambda v: _number(v) and v >= 0, "a number of at least 0", "0 is off")
+        self._require("share_dynamic", lambda v: _number(v) and 0 <= v <= 1, "a fraction in [0, 1]", "0.6 means 60 %")
+        self._require("camera", lambda v: v in CAMERAS, f"one of {', '.join(CAMERAS)}", "choose one of them")
         unknown = [shape for shape in self.shapes if shape not in SHAPES]
-        _require(self.shapes and not unknown, "shapes", f"some of {', '.join(SHAPES)}", self.shapes, f"drop {unknown}")
+        self._require("shapes", lambda v: v and not unknown, f"some of {', '.join(SHAPES)}", f"drop {unknown}")
 
-    def _check_numbers(self) -> None:
-        _check_integers("frames", (self.frames,), 1, pair=False)
-        _check_integers("tracks", (self.tracks,), 1, pair=False)
-        positive = {"fps": self.fps, "speed": self.speed, "drop": self.drop}
-        for name, value in positive.items():
-            _require(_finite(value) and value > 0, name, "a positive number", value, "1 is the usual scale")
-        for name in ("handheld", "stereo_baseline"):
+    def _require(self, names: str, fits: Callable[[Any], object], expected: str, remedy: str) -> None:
+        for name in names.split():
             value = getattr(self, name)
-            _require(_finite(value) and value >= 0, name, "a number of at least 0", value, "0 switches it off")
-        fine = _finite(self.share_dynamic) and 0 <= self.share_dynamic <= 1
-        _require(fine, "share_dynamic", "a fraction in [0, 1]", self.share_dynamic, "0.6 means 60 %")
+            if not fits(value):
+                raise ValueError(f"SimulationConfig.{name}: expected {expected}, got {value!r}; {remedy}")
 
 
-def _finite(value: object) -> bool:
+def _number(value: object) -> bool:
     return isinstance(value, (int, float, np.number)) and bool(np.isfinite(value))
 
 
-def _check_integers(name: str, values: tuple, low: int, pair: bool = True) -> None:
-    whole = all(isinstance(value, (int, np.integer)) and value >= low for value in values)
-    wanted = "two whole numbers" if pair else "a whole number"
-    _require(whole and (len(values) == 2 or not pair), name, f"{wanted} of at least {low}", values, "change it")
-
-
-def _require(condition: object, name: str, expected: str, received: object, remedy: str) -> None:
-    if not condition:
-        raise ValueError(f"SimulationConfig.{name}: expected {expected}, got {received!r}; {remedy}")
+def _whole(low: int, *values: object) -> bool:
+    return all(isinstance(value, (int, np.integer)) and value >= low for value in values)

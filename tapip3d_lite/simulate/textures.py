@@ -7,13 +7,12 @@ regular pattern can be matched. Colours are linear reflectances in [0, 1].
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from tapip3d_lite.simulate.patterns import PATTERNS, Pattern, mix, smooth_step, waves
+from tapip3d_lite.simulate.patterns import PATTERNS, Pattern, mix, smooth_field, smooth_step
 
 KINDS = tuple(PATTERNS)
+Texture = Pattern  # from body coordinates (P, 3) to linear reflectances (P, 3) float32 in [0, 1]
 
 # Each row holds colours that go together (sRGB); the first is the ground.
 _TOYS = """
@@ -29,59 +28,17 @@ _WOODS = (
 )
 
 
-@dataclass(frozen=True)
-class Texture:
-    """A colour for every position of a body, made by `random_texture`.
-
-    Attributes:
-        kind: one of `KINDS`.
-        pattern: maps pattern coordinates (P, 3) to colours (P, 3).
-        frame: (3, 3) body to pattern coordinates, x' = x @ frame + offset.
-        offset: (3,).
-        slow, fine: fields of the tint over the body and of the grain.
-        accent: (3,) colour that the tint leans to.
-    """
-
-    kind: str
-    pattern: Pattern
-    frame: np.ndarray
-    offset: np.ndarray
-    slow: Pattern
-    fine: Pattern
-    accent: np.ndarray
-
-    def color(self, points: np.ndarray) -> np.ndarray:
-        """Linear reflectances (P, 3) float32 in [0, 1] at body coordinates (P, 3)."""
-        # Thin matrix products now and then raise the processor's "invalid" flag from lanes that they do not use.
-        with np.errstate(invalid="ignore"):
-            points = np.asarray(points, np.float32) @ self.frame + self.offset
-            color = self.pattern(points)
-            tint = self.slow(points)[:, None]
-            color += (self.accent - color) * (0.14 + 0.12 * tint)
-            color *= (1 + 0.2 * tint) * (1 + 0.1 * self.fine(points)[:, None])
-        return np.clip(color, 0.01, 0.98, out=color)
-
-
 def random_texture(
     rng: np.random.Generator, kind: str | None = None, scale: float = 1.0, flat: bool = False
 ) -> Texture:
-    """Draw a texture.
+    """Draw a texture of one of the `KINDS`, by default any; bodies have scale 1, floors and backdrops want 2 to 6.
 
-    Args:
-        rng: random generator of everything that is drawn.
-        kind: one of `KINDS`, or None for any.
-        scale: size of the features relative to those of bodies; floors and backdrops want 2 to 6.
-        flat: for a surface in the plane z = 0: turn the pattern about z only and cut its cells through the middle.
-
-    Raises:
-        ValueError: unknown kind.
+    A flat one, for the plane z = 0, has its pattern turned about z only and its cells cut through the middle.
     """
     kind = kind or str(rng.choice(KINDS))
-    if kind not in PATTERNS:
-        raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
     colors = _palette(rng, {"wood": _WOODS, "marble": _STONES, "terrazzo": _STONES}.get(kind, _TOYS))
     if flat:  # bodies should stand out from the ground
-        colors += np.float32(0.35) * (colors.mean(0) - colors)
+        colors += 0.35 * (colors.mean(0) - colors)
     pattern = PATTERNS[kind](rng, colors)
     offset = rng.uniform(-2, 2, 3)
     turn = rng.uniform(0, 2 * np.pi) if flat else rng.uniform(-0.3, 0.3)
@@ -92,15 +49,21 @@ def random_texture(
     else:
         tilt = rng.uniform(0.08, 0.35)  # so that no flat face runs along an edge of the pattern
         frame = frame @ [[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]]
-    return Texture(
-        kind,
-        pattern,
-        (frame / scale).astype(np.float32),
-        offset.astype(np.float32),
-        waves(rng, 6, 0.9),
-        waves(rng, 8, 0.12),
-        colors[rng.integers(1, len(colors))],
-    )
+    frame, offset = (frame / scale).astype(np.float32), offset.astype(np.float32)
+    slow, fine = smooth_field(rng, 6, 0.9), smooth_field(rng, 8, 0.12)
+    accent = colors[rng.integers(1, len(colors))]  # the tint leans to it
+
+    def texture(points: np.ndarray) -> np.ndarray:
+        # Thin matrix products now and then raise the processor's "invalid" flag from lanes that they do not use.
+        with np.errstate(invalid="ignore"):
+            points = np.asarray(points, np.float32) @ frame + offset
+            color = pattern(points)
+            tint = slow(points)[:, None]
+            color += (accent - color) * (0.14 + 0.12 * tint)
+            color *= (1 + 0.2 * tint) * (1 + 0.1 * fine(points)[:, None])
+        return np.clip(color, 0.01, 0.98, out=color)
+
+    return texture
 
 
 def _palette(rng: np.random.Generator, rows: str) -> np.ndarray:
@@ -112,29 +75,8 @@ def _palette(rng: np.random.Generator, rows: str) -> np.ndarray:
     return linear[np.r_[0, 1 + rng.permutation(len(linear) - 1)]]
 
 
-@dataclass(frozen=True)
-class Sky:
-    """A soft gradient above the horizon (z is up) with clouds, and haze below, made by `random_sky`."""
-
-    zenith: np.ndarray
-    horizon: np.ndarray
-    ground: np.ndarray
-    clouds: Pattern
-    cover: float
-
-    def color(self, directions: np.ndarray) -> np.ndarray:
-        """Linear colours (P, 3) float32 in [0, 1] of unit directions (P, 3), z up."""
-        d = np.asarray(directions, np.float32)
-        up = d[:, 2]
-        color = mix(self.horizon, self.zenith, np.clip(up, 0, 1) ** np.float32(0.6))
-        plane = d / (np.maximum(up, 0)[:, None] + np.float32(0.3))
-        cloud = smooth_step(self.clouds(plane) + np.float32(self.cover), 1.6) * np.clip(4 * up, 0, 1)
-        color = mix(color, np.float32([0.95, 0.95, 0.97]), np.float32(0.8) * cloud)
-        return np.clip(mix(color, self.ground, smooth_step(-up - np.float32(0.02), 0.06)), 0, 1)
-
-
-def random_sky(rng: np.random.Generator) -> Sky:
-    """Draw a sky: clear blue, hazy, or evening."""
+def random_sky(rng: np.random.Generator) -> Texture:
+    """Draw a sky, clear blue, hazy, or evening: colours of unit directions (P, 3), z up, with clouds, and haze below."""
     zenith, horizon = [
         ([0.10, 0.27, 0.62], [0.62, 0.76, 0.90]),
         ([0.30, 0.42, 0.58], [0.78, 0.80, 0.82]),
@@ -142,4 +84,16 @@ def random_sky(rng: np.random.Generator) -> Sky:
         ([0.05, 0.35, 0.66], [0.72, 0.86, 0.88]),
     ][rng.integers(4)]
     ground = np.float32(rng.uniform(0.18, 0.4)) * rng.uniform(0.8, 1.1, 3)
-    return Sky(*(np.array(c, np.float32) for c in (zenith, horizon, ground)), waves(rng, 9, 1.3), rng.uniform(-1, 0.3))
+    zenith, horizon, ground = (np.array(color, np.float32) for color in (zenith, horizon, ground))
+    clouds, cover = smooth_field(rng, 9, 1.3), rng.uniform(-1, 0.3)
+
+    def sky(directions: np.ndarray) -> np.ndarray:
+        d = np.asarray(directions, np.float32)
+        up = d[:, 2]
+        color = mix(horizon, zenith, np.clip(up, 0, 1) ** 0.6)
+        plane = d / (np.maximum(up, 0)[:, None] + 0.3)
+        cloud = smooth_step(clouds(plane) + cover, 1.6) * np.clip(4 * up, 0, 1)
+        color = mix(color, np.float32([0.95, 0.95, 0.97]), 0.8 * cloud)
+        return np.clip(mix(color, ground, smooth_step(-up - 0.02, 0.06)), 0, 1)
+
+    return sky
