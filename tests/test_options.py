@@ -102,11 +102,11 @@ def arguments(lite, clip, file, folder):
         "tapvid2d_metrics": {**flat, "queries": rows, "mode": "strided", "per_track": True},
         "evaluate": {"pred": pred.select([0, 1]), "clip": clip, "truth": truth.select([0, 1])},
         "list_trackers": {},
-        "load_tracker": {"name": shipped_weights()["lite"], "device": cpu},
+        "load_tracker": {"name": shipped_weights()["lite"], "device": cpu, "fast": False},
         "save_weights": {"tracker": lite, "path": folder / "lite.safetensors", "half": True},
-        "load_weights": {"path": folder / "lite.safetensors", "device": cpu},
+        "load_weights": {"path": folder / "lite.safetensors", "device": cpu, "fast": False},
         "track": {"tracker": lite, "clip": clip, "queries": rows, "bidirectional": False, "progress": True, **tracking},
-        "stream": {"tracker": lite, "queries": rows, **tracking},
+        "stream": {"tracker": lite, "queries": rows, "watch": lambda step: None, **tracking},
         "push": frame,
         "contact_sheet": {"clips": [clip, clip], "frames": 2, "width": 1.0},
         "depth_map": {"clip": clip, "frame": 1, "ax": ax},
@@ -114,12 +114,10 @@ def arguments(lite, clip, file, folder):
         "overview": {"clip": clip, "tracks": pred, "columns": 2},
         "save_html": {"figure": page, "path": folder / "page.html"},
         "save_png": {"figure": drawn, "path": folder / "figure.png", "dpi": 50},
-        "scores_bar": {"scores": {"static": t3d.evaluate(pred, clip)}, "metrics": ("OA",)},
         "show_3d": {"figure": page, "twin": drawn},
         "track_colors": {"clip": clip, "tracks": pred},
         "tracks_3d": {"clip": clip, "tracks": pred, "points": 300, "max_tracks": 3, "tail": 2, "title": "tracks"},
         "tracks_3d_static": {"clip": clip, "tracks": pred, "frames": [0, 3], "points": 300},
-        "tracks_over_time": {"curves": {"x": pred.xyz[:, 0]}, "labels": ("a", "b", "c"), "unit": "metres"},
     }  # fmt: skip
 
 
@@ -193,7 +191,7 @@ def flags(values, prefix=""):
 def lines(sample, folder):
     """All lines to try, in their order: the card is of the training and of the benchmark's results before it."""
     recipe = TrainConfig.recipe(
-        clips=1, matching_steps=1, steps=1, frames=(5, 5), iterations=(1, 1), validation=1, evaluate_every=1,
+        clips=1, matching_steps=1, steps=1, minutes=0.02, frames=(5, 5), iterations=(1, 1), validation=1, evaluate_every=1,
         train_encoder=True, augment=True, init="lite", tracker={},
     ).to_dict()  # fmt: skip
     run, results = folder / "run", folder / "results.json"
