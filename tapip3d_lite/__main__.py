@@ -13,9 +13,16 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 import tapip3d_lite as t3d
+from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, run_benchmark, summary_table
+from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
+from tapip3d_lite.files import write_text
+from tapip3d_lite.lab.card import model_card
+from tapip3d_lite.simulate import simulate_dataset
+from tapip3d_lite.trackers import tracker_runs
 from tapip3d_lite.training.recipe import TrainConfig
 
 
@@ -40,19 +47,14 @@ def track(
     if loaded.tracks is not None and own_queries:
         scores = t3d.evaluate(result, loaded)
         print("  ".join(f"{name} {scores[name]:.3f}" for name in ("AJ3D", "APD3D", "OA")))
-    _write(loaded, result, out, html, png)
-
-
-def _write(clip: t3d.Clip, result: t3d.Tracks, out: Path | None, html: Path | None, png: Path | None) -> None:
     if out:
-        result.save(out, clip)
-        print(f"wrote {out}")
+        result.save(out, loaded)
     if html:
-        t3d.figures.save_html(t3d.figures.tracks_3d(clip, result), html)
-        print(f"wrote {html}")
+        t3d.figures.save_html(t3d.figures.tracks_3d(loaded, result), html)
     if png:
-        t3d.figures.save_png(t3d.figures.overview(clip, result), png)
-        print(f"wrote {png}")
+        t3d.figures.save_png(t3d.figures.overview(loaded, result), png)
+    for path in filter(None, (out, html, png)):
+        print(f"wrote {path}")
 
 
 def evaluate(
@@ -62,10 +64,6 @@ def evaluate(
     device: str = "cpu",
 ) -> None:
     """Score trackers on clips with true tracks; prints a Markdown table, one row a clip, then the means."""
-    from tqdm import tqdm
-
-    from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
-
     rows, means = {}, {}
     for name in tracker:
         loaded = t3d.load_tracker(name, device=device)
@@ -87,11 +85,8 @@ def benchmark(
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
 ) -> None:
     """Score trackers on the Lite benchmark; prints Markdown tables with 95 % bootstrap intervals over clips."""
-    from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, summary_table
-    from tapip3d_lite.lab.leaderboard import score_trackers
-
     splits = split or SPLITS
-    results = score_trackers(tracker, splits, space, count, out, device)
+    results = run_benchmark(tracker_runs(tracker, space, device), splits, count, out)
     for part in ("", "_dynamic", "_static"):
         print(summary_table(results, tuple(metric + part for metric in METRICS), splits) + "\n")
     if figure:
@@ -126,31 +121,22 @@ def simulate(
     workers: Annotated[int | None, arg(help="processes; default: all cores")] = None,
 ) -> None:
     """Simulate a dataset of small Kubric-like clips with exact 3D tracks."""
-    from tapip3d_lite.simulate import simulate_dataset
-
     simulate_dataset(out, count, config, first_seed=first_seed, workers=workers)
 
 
 def train(
     out: Annotated[Path, arg(help="the training's folder")],
     config: Annotated[TrainConfig, arg(name="")],
-    data: Annotated[
-        Path | None, arg(help="folder of the clips, shared by trainings; missing ones are simulated")
-    ] = None,
+    data: Annotated[Path | None, arg(help="folder of clips, shared by trainings; missing ones are simulated")] = None,
     resume: Annotated[bool, arg(help="continue from the folder's checkpoint, with its recipe")] = False,
     device: Annotated[str, arg(help="cpu or cuda; several processes: torchrun -m tapip3d_lite train …")] = "cpu",
-    workers: Annotated[
-        int | None, arg(help="processes that prepare examples; default: 0 on a CPU, else cores less two")
-    ] = None,
+    workers: Annotated[int | None, arg(help="processes for examples; default: 0 on a CPU, else cores less two")] = None,
     compiled: Annotated[bool, arg(help="compile the tracker's parts, for a GPU: slow to start, then faster")] = False,
 ) -> None:
     """Train a tracker on simulated clips, by default with the recipe of --preset (lite or paper); Ctrl-C saves and stops, --resume continues exactly there."""
     from tapip3d_lite.lab.train import train as run
 
-    try:
-        finished, text = run(out, config, data, resume, device, workers, compiled)
-    except FloatingPointError as error:
-        raise ValueError(str(error)) from error
+    finished, text = run(out, config, data, resume, device, workers, compiled)
     print(text)
     if not finished:
         sys.exit(130)
@@ -164,12 +150,9 @@ def card(
     out: Annotated[Path, arg(help="Markdown file")] = Path("MODEL_CARD.md"),
     name: Annotated[str, arg(help="of the model")] = "lite",
     weights: Annotated[Path | None, arg(help="the file, if not the folder's own")] = None,
-    command: Annotated[str | None, arg(help="that made it, e.g. with torchrun; default: from the recipe")] = None,
+    command: Annotated[str | None, arg(help="that made it, shown beside the recipe")] = None,
 ) -> None:
     """Write the model card of a training folder and of results that `benchmark --out` wrote."""
-    from tapip3d_lite.files import write_text
-    from tapip3d_lite.lab.card import model_card
-
     write_text(out, model_card(folder, results, hardware, name, command, weights))
     print(f"wrote {out}")
 
@@ -197,18 +180,8 @@ def import_(checkpoint: Positional[Path], out: Positional[Path], /) -> None:
     print(f"wrote {out}: {count / 1e6:.2f} M parameters; use it with --tracker {out}")
 
 
-COMMANDS = {
-    "track": track,
-    "evaluate": evaluate,
-    "benchmark": benchmark,
-    "demo": demo,
-    "check": check,
-    "simulate": simulate,
-    "train": train,
-    "card": card,
-    "curves": curves,
-    "import": import_,
-}
+_FUNCTIONS = (track, evaluate, benchmark, demo, check, simulate, train, card, curves, import_)
+COMMANDS = {function.__name__.rstrip("_"): function for function in _FUNCTIONS}
 
 
 def _train(arguments: list[str]) -> Callable[..., None]:
@@ -223,7 +196,7 @@ def main() -> None:
     try:
         chosen = COMMANDS | {"train": _train(sys.argv[1:])}
         tyro.extras.subcommand_cli_from_dict(chosen, prog="tapip3d_lite", description=__doc__.splitlines()[0])
-    except ValueError as error:
+    except (ValueError, FloatingPointError) as error:  # the second one: a training's loss
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:

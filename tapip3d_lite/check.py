@@ -15,9 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert, point_map, project, unproject
@@ -34,20 +36,20 @@ class Finding:
     Attributes:
         name: short key, e.g. `"camera_to_world"`.
         message: what seems wrong.
+        remedy: what to do, in words.
+        fix: maps the clip to the corrected clip.
         measure: what the two numbers measure.
         before: the measure of the clip as given.
         after: the measure once the fix is applied.
-        remedy: what to do, in words.
-        fix: maps the clip to the corrected clip.
     """
 
     name: str
     message: str
+    remedy: str
+    fix: Callable[[Clip], Clip]
     measure: str
     before: float
     after: float
-    remedy: str
-    fix: Callable[[Clip], Clip]
 
     def __str__(self) -> str:
         numbers = f"{self.measure}: {self.before:.4g} as given, {self.after:.4g} after the fix"
@@ -81,26 +83,23 @@ def _wrong_intrinsics(clip: Clip) -> list[Finding]:
     focal = float(np.median(clip.intrinsics[:, 0, 0]))
     offset = float(np.abs(point / centre - 1).max())
     if focal < width / 20 and (np.abs(point) < 2).all():
-        scaled = _with_intrinsics(np.array([width, height]), -0.5)
+        name, fix = "normalised_intrinsics", partial(_rescaled, scale=(width, height), shift=-0.5)
         message = f"intrinsics look normalised: fx = {focal:.3g} for an image {width} pixels wide"
         remedy = "Multiply row 0 by W and row 1 by H, then subtract 0.5 from cx and cy."
-        name = "normalised_intrinsics"
     elif offset > 0.1 and (point > 0).all():
         ratio = centre / point
-        scaled = _with_intrinsics(ratio, 0.0)
+        name, fix = "intrinsics_of_another_size", partial(_rescaled, scale=ratio, shift=0.0)
         # A crop shifts the point as well. Motion decides; without motion only a point outside the image proves it.
-        likely = bool((point > (width, height)).any())
-        if not _motion_prefers(clip, scaled(clip), likely):
+        if not _motion_prefers(clip, fix(clip), otherwise=bool((point > (width, height)).any())):
             return []
         size = np.rint(2 * point + 1).astype(int)
         message = f"intrinsics look made for a {size[0]}x{size[1]} image, the video is {width}x{height}"
         remedy = f"Multiply row 0 by {ratio[0]:.4g} and row 1 by {ratio[1]:.4g} (geometry.resize_intrinsics)."
-        name = "intrinsics_of_another_size"
     else:
         return []
-    after = float(np.abs(np.median(scaled(clip).intrinsics[:, :2, 2], axis=0) / centre - 1).max())
+    after = float(np.abs(np.median(fix(clip).intrinsics[:, :2, 2], axis=0) / centre - 1).max())
     measure = "principal point's distance from the centre, in half images"
-    return [Finding(name, message, measure, offset, after, remedy, scaled)]
+    return [Finding(name, message, remedy, fix, measure, offset, after)]
 
 
 def _motion_prefers(clip: Clip, fixed: Clip, otherwise: bool) -> bool:
@@ -111,14 +110,11 @@ def _motion_prefers(clip: Clip, fixed: Clip, otherwise: bool) -> bool:
     return after < before
 
 
-def _with_intrinsics(scale: np.ndarray, shift: float) -> Callable[[Clip], Clip]:
-    def fix(clip: Clip) -> Clip:
-        matrix = clip.intrinsics.copy()
-        matrix[:, :2] *= np.asarray(scale, np.float32)[:, None]
-        matrix[:, :2, 2] += shift
-        return _rebuilt(clip, intrinsics=matrix)
-
-    return fix
+def _rescaled(clip: Clip, scale: ArrayLike, shift: float) -> Clip:
+    matrix = clip.intrinsics.copy()
+    matrix[:, :2] *= np.asarray(scale, np.float32)[:, None]
+    matrix[:, :2, 2] += shift
+    return _rebuilt(clip, intrinsics=matrix)
 
 
 def _ray_length(clip: Clip) -> list[Finding]:
@@ -127,7 +123,7 @@ def _ray_length(clip: Clip) -> list[Finding]:
         return []
     remedy = "Divide the depth by |K^-1 (u, v, 1)| of each pixel."
     message = "depths look like ray lengths, not z: planes bulge"
-    return [Finding("ray_length", message, "curvature of planes in 1/depth", before, after, remedy, _ray_to_z)]
+    return [Finding("ray_length", message, remedy, _ray_to_z, "curvature of planes in 1/depth", before, after)]
 
 
 def _ray_to_z(clip: Clip) -> Clip:
@@ -135,31 +131,30 @@ def _ray_to_z(clip: Clip) -> Clip:
     return _rebuilt(clip, depths=clip.depths / np.linalg.norm(rays, axis=-1))
 
 
-def _flip(clip: Clip) -> Clip:
-    return _rebuilt(clip, extrinsics=np.diag([1, -1, -1, 1]).astype(np.float32) @ clip.extrinsics)
-
-
-def _inverse(clip: Clip) -> Clip:
-    return _rebuilt(clip, extrinsics=invert(clip.extrinsics))
-
-
-def _smaller_translations(clip: Clip) -> Clip:
-    extrinsics = clip.extrinsics.copy()
-    extrinsics[:, :3, 3] *= 1e-3
-    return _rebuilt(clip, extrinsics=extrinsics)
-
-
-_MESSAGES = {
-    "camera_to_world": "extrinsics look camera-to-world",
-    "opengl_axes": "cameras look along -z with y up (OpenGL, Blender)",
-    "depth_in_millimetres": "depths are 1000 times too large for the poses",
-    "poses_in_millimetres": "translations are 1000 times too large for the depths",
-}
-_REMEDIES = {
-    "camera_to_world": ("Invert every matrix (geometry.invert).", _inverse),
-    "opengl_axes": ("Multiply extrinsics from the left by diag(1, -1, -1, 1).", _flip),
-    "depth_in_millimetres": ("Multiply depths by 0.001.", lambda c: _rebuilt(c, depths=c.depths * np.float32(1e-3))),
-    "poses_in_millimetres": ("Multiply translations by 0.001.", _smaller_translations),
+_FLIP = np.diag([1, -1, -1, 1]).astype(np.float32)
+_SHORTER = np.array([[1, 1, 1, 1e-3]] * 3 + [[1, 1, 1, 1]], np.float32)
+# Name: what seems wrong, what to do, and the same as a function.
+_MIX_UPS = {
+    "camera_to_world": (
+        "extrinsics look camera-to-world",
+        "Invert every matrix (geometry.invert).",
+        lambda clip: _rebuilt(clip, extrinsics=invert(clip.extrinsics)),
+    ),
+    "opengl_axes": (
+        "cameras look along -z with y up (OpenGL, Blender)",
+        "Multiply extrinsics from the left by diag(1, -1, -1, 1).",
+        lambda clip: _rebuilt(clip, extrinsics=_FLIP @ clip.extrinsics),
+    ),
+    "depth_in_millimetres": (
+        "depths are 1000 times too large for the poses",
+        "Multiply depths by 0.001.",
+        lambda clip: _rebuilt(clip, depths=clip.depths * np.float32(1e-3)),
+    ),
+    "poses_in_millimetres": (
+        "translations are 1000 times too large for the depths",
+        "Multiply translations by 0.001.",
+        lambda clip: _rebuilt(clip, extrinsics=_SHORTER * clip.extrinsics),
+    ),
 }
 # One of each may be needed together.
 _POSES = [], ["camera_to_world"], ["opengl_axes"], ["camera_to_world", "opengl_axes"]
@@ -178,17 +173,14 @@ def _wrong_motion(clip: Clip) -> list[Finding]:
             error = consistency(_fixed(turned, unit))
             scored.append((error / _GAIN ** len(pose + unit), error, pose + unit))
     _, after, names = min(scored, key=lambda row: row[0])
-    return [_finding(name, "relative depth error of the static scene", before, after) for name in names]
+    measure = "relative depth error of the static scene"
+    return [Finding(name, *_MIX_UPS[name], measure, before, after) for name in names]
 
 
 def _fixed(clip: Clip, names: list[str]) -> Clip:
     for name in names:
-        clip = _REMEDIES[name][1](clip)
+        clip = _MIX_UPS[name][2](clip)
     return clip
-
-
-def _finding(name: str, measure: str, before: float, after: float) -> Finding:
-    return Finding(name, _MESSAGES[name], measure, before, after, *_REMEDIES[name])
 
 
 def _plausible_unit(clip: Clip, name: str) -> bool:
@@ -204,8 +196,8 @@ def _whole_numbers(clip: Clip) -> list[Finding]:
     if share < 1 or np.median(depths) < 100:
         return []
     after = float(((depths * 1e-3) == np.rint(depths * 1e-3)).mean())
-    finding = _finding("depth_in_millimetres", "share of whole numbers", share, after)
-    return [replace(finding, message="depths look like millimetres")]
+    name, message = "depth_in_millimetres", "depths look like millimetres"
+    return [Finding(name, message, *_MIX_UPS[name][1:], "share of whole numbers", share, after)]
 
 
 def _rebuilt(clip: Clip, **changes: np.ndarray) -> Clip:
@@ -213,61 +205,41 @@ def _rebuilt(clip: Clip, **changes: np.ndarray) -> Clip:
     return replace(clip, queries=None, tracks=None, **changes)
 
 
-def consistency(clip: Clip, samples: int = 1500, pairs: int = 8) -> float:
-    """Static-scene error: how well points carried between frames meet the depth there, over all frame pairs.
+def consistency(clip: Clip) -> float:
+    """How well static points carried between a dozen pairs of frames meet the depth there: a low quantile of relative errors.
 
-    The number is a low quantile of relative depth errors, since parts of a correct clip disagree too: moving objects,
-    and pixels that become hidden or leave the view.
-
-    Args:
-        clip: the clip.
-        samples: pixels lifted per pair.
-        pairs: frame pairs, spread over the clip at growing gaps.
-
-    Returns:
-        0 for a perfect static scene; at most 0.25, the value of a point that is lost altogether.
+    Low, since parts of a correct clip disagree too: moving objects, and pixels that become hidden or leave the view.
+    0 for a perfect static scene; at most 0.25, the value of a point that is lost altogether.
     """
-    rng = np.random.default_rng(0)
-    errors = [_carry(clip, t, s, samples, rng) for t, s in _frame_pairs(len(clip), pairs)]
+    rng, frames = np.random.default_rng(0), len(clip)
+    gaps = sorted({max(1, round(frames * share)) for share in (0.1, 0.25, 0.5)})
+    pairs = [(t, t + gap) for gap in gaps for t in np.linspace(0, max(frames - gap - 1, 0), 4).astype(int)]
+    errors = [_carry(clip, t, s, rng) for t, s in dict.fromkeys(pairs) if s < frames]
     pooled = np.concatenate(errors) if errors else np.zeros(1)
     return float(np.quantile(pooled, 0.25)) if pooled.size else _CAP
 
 
-def flatness(clip: Clip, frames: int = 4) -> float:
-    """Lower quartile of the relative second differences of inverse depth: near 0 in scenes with planes.
-
-    Args:
-        clip: any clip.
-        frames: number of frames to look at.
-
-    Returns:
-        The quartile over pixels, dimensionless; the step is a twelfth of the image.
-    """
+def flatness(clip: Clip) -> float:
+    """Lower quartile of the relative second differences of inverse depth in four frames: near 0 in scenes with planes."""
     step = max(1, min(clip.size) // 12)
-    chosen = np.linspace(0, len(clip) - 1, frames).astype(int)
+    chosen = np.linspace(0, len(clip) - 1, 4).astype(int)
     values = np.concatenate([_second_differences(clip.depths[t], step) for t in chosen])
     return float(np.quantile(values, 0.25)) if values.size else 0.0
 
 
-def _frame_pairs(frames: int, pairs: int) -> list[tuple[int, int]]:
-    gaps = sorted({max(1, round(frames * share)) for share in (0.1, 0.25, 0.5)})
-    chosen = [(t, t + gap) for gap in gaps for t in np.linspace(0, max(frames - gap - 1, 0), pairs // 2).astype(int)]
-    return [(t, s) for t, s in dict.fromkeys(chosen) if s < frames]
-
-
-def _carry(clip: Clip, t: int, s: int, samples: int, rng: np.random.Generator) -> np.ndarray:
-    """Capped relative depth errors of pixels of frame t seen from frame s."""
+def _carry(clip: Clip, t: int, s: int, rng: np.random.Generator) -> np.ndarray:
+    """Capped relative depth errors of 1,500 random pixels of frame t seen from frame s."""
     v, u = np.nonzero(clip.depths[t])
     if not len(v):
         return np.zeros(0)
-    pick = rng.integers(0, len(v), samples)
+    pick = rng.integers(0, len(v), 1500)
     uv = np.stack([u[pick], v[pick]], -1).astype(np.float64)
     cameras = [clip.intrinsics[[t, s]].astype(np.float64), clip.extrinsics[[t, s]].astype(np.float64)]
     points = unproject(uv, clip.depths[t, v[pick], u[pick]].astype(np.float64), cameras[0][0], cameras[1][0])
     target, z = project(points, cameras[0][1], cameras[1][1])
     seen = _bilinear_inverse(clip.depths[s], target)
     inside = np.isfinite(seen) & (z > 0)
-    error = np.full(samples, _CAP)
+    error = np.full(len(pick), _CAP)
     error[inside] = np.minimum(np.abs(z[inside] * seen[inside] - 1), _CAP)
     return error[~np.isnan(seen)]  # a pixel without depth is no evidence
 
@@ -291,8 +263,6 @@ def _inverse_depth(depth: np.ndarray) -> np.ndarray:
 
 def _second_differences(depth: np.ndarray, step: int) -> np.ndarray:
     inverse = _inverse_depth(depth)
-    horizontal = inverse[:, 2 * step :] + inverse[:, : -2 * step] - 2 * inverse[:, step:-step]
-    vertical = inverse[2 * step :] + inverse[: -2 * step] - 2 * inverse[step:-step]
-    relative = [horizontal / inverse[:, step:-step], vertical / inverse[step:-step]]
+    relative = [(x[2 * step :] + x[: -2 * step] - 2 * x[step:-step]) / x[step:-step] for x in (inverse, inverse.T)]
     values = np.abs(np.concatenate([r.ravel() for r in relative]))
     return values[np.isfinite(values)]

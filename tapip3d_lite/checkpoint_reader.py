@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from types import FunctionType, SimpleNamespace
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 
@@ -35,18 +35,13 @@ _HARMLESS = {
         "tuple",
     },
     "collections": {"OrderedDict", "defaultdict"},
-    "torch": {
-        "Size",
-        "device",
-        *(str(d).removeprefix("torch.") for d in vars(torch).values() if isinstance(d, torch.dtype)),
-    },
+    "torch": {"Size", "device", *(str(x)[6:] for x in vars(torch).values() if isinstance(x, torch.dtype))},
     "torch._utils": {"_rebuild_tensor", "_rebuild_tensor_v2", "_rebuild_parameter"},
     "numpy": {"dtype", "ndarray"},
     "numpy.core.multiarray": {"scalar", "_reconstruct"},
     "numpy._core.multiarray": {"scalar", "_reconstruct"},
     "_codecs": {"encode"},  # how numpy writes bytes at protocol 2
 }
-_OLD_NAMES = {"__builtin__": "builtins", "copy_reg": "copyreg"}
 # What these packages define is data to us: recorded, never called.
 _RECORDED = {
     "omegaconf",
@@ -69,12 +64,11 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, torch.T
         ValueError: not such a file, or a refused global in its pickle.
     """
     content = _read_pickle(path)
-    missing = [key for key in ("cfg", "weight") if not isinstance(content, Mapping) or key not in content]
+    content = content if isinstance(content, Mapping) else {type(content).__name__: content}
+    missing = " and ".join(key for key in ("cfg", "weight") if key not in content)
     if missing:
-        found = ", ".join(map(str, content)) if isinstance(content, Mapping) else type(content).__name__
-        raise ValueError(
-            f'{path}: expected a checkpoint {{"cfg", "weight"}}, {" and ".join(missing)} missing in {found}'
-        )
+        found = ", ".join(map(str, content))
+        raise ValueError(f'{path}: expected a checkpoint {{"cfg", "weight"}}, {missing} missing in {found}')
     try:
         cfg = plain(content["cfg"])
         cfg = _resolved(cfg, cfg)
@@ -122,8 +116,8 @@ class _Unpickler(pickle.Unpickler):
     """Finds only what `_HARMLESS` lists, and records for configuration classes."""
 
     def find_class(self, module: str, name: str) -> Any:
-        module = _OLD_NAMES.get(module, module)
-        name = "int" if (module, name) == ("builtins", "long") else name
+        if module == "__builtin__":  # of Python 2
+            module, name = "builtins", "int" if name == "long" else name
         if name in _HARMLESS.get(module, ()):
             found = super().find_class(module, name)
             # A pickle may set attributes of what it finds; a function's defaults would stay changed in this process.
@@ -133,16 +127,18 @@ class _Unpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name} is refused")
 
 
-def _load(file: BinaryIO, **options: Any) -> Any:
-    return _Unpickler(file, **options).load()
-
-
 # torch.load does the rest (storages, devices, byte order, the formats before and after 1.6) around this pickle module.
-_PICKLE = SimpleNamespace(Unpickler=_Unpickler, load=_load, UnpicklingError=pickle.UnpicklingError, __name__="pickle")
+_PICKLE = SimpleNamespace(
+    __name__="pickle",
+    Unpickler=_Unpickler,
+    UnpicklingError=pickle.UnpicklingError,
+    load=lambda file, **options: _Unpickler(file, **options).load(),
+)
 
 
 def _read_pickle(path: str | Path) -> Any:
-    _exists(path)
+    if not Path(path).is_file():
+        raise ValueError(f"{path}: no such file; check the path")
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             if any(name.endswith("constants.pkl") for name in archive.namelist()):
@@ -153,13 +149,11 @@ def _read_pickle(path: str | Path) -> Any:
         raise ValueError(f"{path}: a tar archive of torch before 0.2; load and save it with a newer torch first")
     try:
         return torch.load(path, map_location="cpu", pickle_module=_PICKLE, weights_only=False)
-    except pickle.UnpicklingError as error:
-        raise ValueError(
-            f"{path}: refused, since {error}: a checkpoint needs no such thing, and it could run code on this machine"
-            if "is refused" in str(error)
-            else f"{path}: not a readable checkpoint ({error})"
-        ) from None
     except Exception as error:  # a damaged pickle fails in any way, an assertion or too little memory among them
+        if isinstance(error, pickle.UnpicklingError) and "is refused" in str(error):
+            raise ValueError(
+                f"{path}: {error}: a checkpoint needs no such thing, and it could run code on this machine"
+            ) from None
         raise ValueError(
             f"{path}: not a readable checkpoint ({type(error).__name__}: {error}); it may be truncated or of another format"
         ) from error
@@ -180,8 +174,3 @@ def _resolved(value: Any, root: Any) -> Any:
             return value  # a reference into a part we do not need; the strict mapping complains if we do
         target = target[part]
     return _resolved(target, root)
-
-
-def _exists(path: str | Path) -> None:
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: no such file; check the path")

@@ -7,7 +7,7 @@ the truth is known, `tracks`, `visible` and `dynamic`. Tracks on disk are the au
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -48,29 +48,20 @@ class Tracks:
         _set(self, "visible", bools("Tracks.visible", self.visible, (frames, count)))
         _set(self, "queries", floats("Tracks.queries", self.queries, (count, 4), finite=True))
         if self.visible_logits is not None:
-            logits = floats("Tracks.visible_logits", self.visible_logits, (frames, count))
-            _set(self, "visible_logits", logits)
+            _set(self, "visible_logits", floats("Tracks.visible_logits", self.visible_logits, (frames, count)))
         if self.dynamic is not None:
             _set(self, "dynamic", bools("Tracks.dynamic", self.dynamic, (count,)))
 
     def select(self, which: np.ndarray | slice) -> Tracks:
         """The tracks that an index, a slice or a boolean mask over N picks."""
-        logits, dynamic = self.visible_logits, self.dynamic
-        return Tracks(
-            self.xyz[:, which],
-            self.visible[:, which],
-            self.queries[which],
-            None if logits is None else logits[:, which],
-            None if dynamic is None else dynamic[which],
-        )
+        logits = None if self.visible_logits is None else self.visible_logits[:, which]
+        dynamic = None if self.dynamic is None else self.dynamic[which]
+        return Tracks(self.xyz[:, which], self.visible[:, which], self.queries[which], logits, dynamic)
 
     def save(self, path: str | Path, clip: Clip | None = None) -> None:
         """Write the authors' result npz atomically; with the clip, everything that their viewer needs."""
         arrays = {"coords": self.xyz, "visibs": self.visible, "query_points": self.queries}
-        if self.visible_logits is not None:
-            arrays["visib_logits"] = self.visible_logits
-        if self.dynamic is not None:
-            arrays["dynamic"] = self.dynamic
+        arrays |= {"visib_logits": self.visible_logits, "dynamic": self.dynamic}
         if clip is not None:
             arrays["video"] = np.moveaxis(clip.video, -1, 1).astype(np.float32) / 255
             arrays |= {key: getattr(clip, key) for key in _CLIP_KEYS[1:]}
@@ -117,10 +108,8 @@ class Clip:
             )
         _set(self, "depths", depths)
         for key, side in (("intrinsics", 3), ("extrinsics", 4)):
-            value = floats(
-                f"Clip.{key}", getattr(self, key), (frames, side, side), finite=True, like="video (T, H, W, 3)"
-            )
-            _set(self, key, value)
+            shape, like = (frames, side, side), "video (T, H, W, 3)"
+            _set(self, key, floats(f"Clip.{key}", getattr(self, key), shape, finite=True, like=like))
         check_cameras(self.intrinsics, self.extrinsics)
         if self.queries is None and self.tracks is not None:
             _set(self, "queries", self.tracks.queries)
@@ -152,38 +141,32 @@ class Clip:
         """Frames [start, stop), with the tracks and queries whose query frame lies inside."""
         if not 0 <= start < stop <= len(self):
             raise ValueError(f"Clip.cut: expected 0 <= start < stop <= {len(self)}, got [{start}, {stop})")
+
+        def begins(rows: np.ndarray) -> np.ndarray:
+            return (rows[:, 0] >= start) & (rows[:, 0] < stop)
+
+        frames, shift = slice(start, stop), np.array([start, 0, 0, 0], np.float32)
         queries, tracks = self.queries, self.tracks
         if tracks is not None:
-            inside = (tracks.queries[:, 0] >= start) & (tracks.queries[:, 0] < stop)
-            kept = tracks.select(inside)
-            logits = kept.visible_logits
-            tracks = Tracks(
-                kept.xyz[start:stop],
-                kept.visible[start:stop],
-                _shift(kept.queries, start),
-                None if logits is None else logits[start:stop],
-                kept.dynamic,
-            )
+            some = tracks.select(begins(tracks.queries))
+            logits = None if some.visible_logits is None else some.visible_logits[frames]
+            tracks = Tracks(some.xyz[frames], some.visible[frames], some.queries - shift, logits, some.dynamic)
         if queries is not None:
-            queries = _shift(queries[(queries[:, 0] >= start) & (queries[:, 0] < stop)], start)
+            queries = queries[begins(queries)] - shift
         # Only what is known to be per frame is cut along: an unknown array may be anything.
-        extras = {k: v[start:stop] if k.endswith("_right") else v for k, v in self.extras.items()}
-        frames = {key: getattr(self, key)[start:stop] for key in _CLIP_KEYS}
-        return replace(self, **frames, queries=queries, tracks=tracks, extras=extras)
+        extras = {k: v[frames] if k.endswith("_right") else v for k, v in self.extras.items()}
+        images = {key: getattr(self, key)[frames] for key in _CLIP_KEYS}
+        return replace(self, **images, queries=queries, tracks=tracks, extras=extras)
 
     def save(self, path: str | Path) -> None:
         """Write the clip as a compressed npz: to a temporary file first, then renamed, so never half written."""
-        arrays = dict(self.extras) | {key: getattr(self, key) for key in _CLIP_KEYS}
-        if self.queries is not None:
-            arrays["query_point"] = self.queries
+        arrays = dict(self.extras) | {key: getattr(self, key) for key in _CLIP_KEYS} | {"query_point": self.queries}
         if self.tracks is not None:
             if not np.array_equal(self.tracks.queries, self.queries):
                 raise ValueError(
                     "Clip.save: tracks.queries differ from clip.queries; one file holds one set of queries"
                 )
-            arrays |= {"tracks": self.tracks.xyz, "visible": self.tracks.visible}
-            if self.tracks.dynamic is not None:
-                arrays["dynamic"] = self.tracks.dynamic
+            arrays |= {"tracks": self.tracks.xyz, "visible": self.tracks.visible, "dynamic": self.tracks.dynamic}
         arrays |= {"name": np.array(self.name), "fps": np.array(self.fps)}
         save_npz(path, arrays)
 
@@ -201,17 +184,16 @@ def load_clip(path: str | Path, points: bool = True) -> Clip:
         ValueError: the file is missing, truncated, not an npz, needs pickle, or its arrays do not fit together.
     """
     arrays = load_npz(path)
-    missing = [key for key in _CLIP_KEYS if key not in arrays]
-    if missing:
-        raise ValueError(
-            f"{path}: a clip needs the keys {', '.join(_CLIP_KEYS)}; {', '.join(missing)} missing, "
-            f"the file has {', '.join(sorted(arrays)) or 'none'}; for RGB-only video estimate depth and pose first (e.g. with MegaSaM)"
-        )
+    remedy = "for RGB-only video estimate depth and pose first (e.g. with MegaSaM)"
+    _require(path, arrays, "a clip", _CLIP_KEYS, remedy)
     frames = len(arrays["video"]) if arrays["video"].ndim else 0
     for key in ("intrinsics", "extrinsics"):
         if arrays[key].ndim == 2:
             arrays[key] = np.repeat(arrays[key][None], frames, axis=0)
-    tracks = _stored_tracks(path, arrays) if points else None
+    tracks = None
+    if points and "tracks" in arrays:
+        _require(path, arrays, "a clip with tracks", ("visible", "query_point"), "add the key or drop tracks")
+        tracks = Tracks(arrays["tracks"], arrays["visible"], arrays["query_point"], None, arrays.get("dynamic"))
     return Clip(
         **{key: arrays[key] for key in _CLIP_KEYS},
         queries=arrays.get("query_point") if points else None,
@@ -229,11 +211,9 @@ def load_tracks(path: str | Path) -> Tracks:
         ValueError: as for `load_clip`.
     """
     arrays = load_npz(path)
-    missing = [key for key in ("coords", "visibs", "query_points") if key not in arrays]
-    if missing:
-        raise ValueError(f"{path}: a result needs coords, visibs, query_points; {', '.join(missing)} missing")
-    optional = arrays.get("visib_logits"), arrays.get("dynamic")
-    return Tracks(arrays["coords"], arrays["visibs"], arrays["query_points"], *optional)
+    needed = ("coords", "visibs", "query_points")
+    _require(path, arrays, "a result", needed, "save one with Tracks.save")
+    return Tracks(*(arrays[key] for key in needed), arrays.get("visib_logits"), arrays.get("dynamic"))
 
 
 def check_queries(clip: Clip, queries: np.ndarray) -> np.ndarray:
@@ -275,17 +255,13 @@ def query_frames(clip: Clip, rows: np.ndarray) -> np.ndarray:
     return t.astype(int)
 
 
-def _stored_tracks(path: str | Path, arrays: dict[str, np.ndarray]) -> Tracks | None:
-    if "tracks" not in arrays:
-        return None
-    missing = [key for key in ("visible", "query_point") if key not in arrays]
+def _require(path: str | Path, arrays: Mapping[str, np.ndarray], what: str, keys: Sequence[str], remedy: str) -> None:
+    missing = [key for key in keys if key not in arrays]
     if missing:
-        raise ValueError(f"{path}: tracks need {' and '.join(missing)} beside them; add the key or drop tracks")
-    return Tracks(arrays["tracks"], arrays["visible"], arrays["query_point"], None, arrays.get("dynamic"))
-
-
-def _shift(queries: np.ndarray, start: int) -> np.ndarray:
-    return queries - np.array([start, 0, 0, 0], np.float32)
+        raise ValueError(
+            f"{path}: {what} needs the keys {', '.join(keys)}; {', '.join(missing)} missing, "
+            f"the file has {', '.join(sorted(arrays)) or 'none'}; {remedy}"
+        )
 
 
 def _set(instance: object, name: str, value: object) -> None:

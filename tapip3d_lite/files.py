@@ -56,10 +56,10 @@ def load_npz(path: str | Path, skip: Collection[str] = ()) -> dict[str, np.ndarr
         ) from error
 
 
-def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a compressed npz atomically."""
+def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray | None]) -> None:
+    """Write a compressed npz atomically, without what is None."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, **{key: value for key, value in arrays.items() if value is not None})
 
 
 def shipped_weights() -> dict[str, Path]:

@@ -74,25 +74,24 @@ def unproject(uv: Array, z: Array, intrinsics: Array, extrinsics: Array | None =
     return points if extrinsics is None else transform(points, invert(extrinsics))
 
 
-def project(points: Array, intrinsics: Array, extrinsics: Array | None = None, min_z: float = 1e-6) -> tuple:
+def project(points: Array, intrinsics: Array, extrinsics: Array | None = None) -> tuple:
     """Project 3D points to pixels: (u, v) = (K X)_xy / z.
 
     Args:
         points: (..., N, 3) in the world frame, or in the camera frame without extrinsics.
         intrinsics: (..., 3, 3), pixels.
         extrinsics: (..., 4, 4) world to camera, or None.
-        min_z: smallest divisor, for points at or behind the camera, so that the result stays finite; the sign of
-            their z reveals them.
 
     Returns:
-        uv (..., N, 2) in pixels and z (..., N), the signed z-depth in the camera frame.
+        uv (..., N, 2) in pixels and z (..., N), the signed z-depth in the camera frame. Points at or behind the camera
+        are divided by 1e-6, so that their uv stays finite; the sign of z reveals them.
     """
     xp = _library(points)
     camera = points if extrinsics is None else transform(points, extrinsics)
     z = camera[..., 2]
     # K X first, then the division: the order of the released model, whose numbers depend on the last bit.
     homogeneous = camera @ intrinsics.swapaxes(-1, -2)
-    return homogeneous[..., :2] / xp.clip(z, min_z, None)[..., None], z
+    return homogeneous[..., :2] / xp.clip(z, 1e-6, None)[..., None], z
 
 
 def point_map(depths: Array, intrinsics: Array, extrinsics: Array | None = None) -> Array:
@@ -148,17 +147,9 @@ def resize_intrinsics(intrinsics: Array, old_size: tuple[int, int], new_size: tu
 
 
 def look_at(eye: Array, target: Array, up: Array) -> Array:
-    """Extrinsics of a camera at `eye` that looks at `target`, with the image's y axis pointing away from `up`.
+    """Extrinsics (..., 4, 4) of a camera at `eye` (..., 3) that looks at `target`, with `up` upwards in the image.
 
-    Args:
-        eye, target: (..., 3) world positions.
-        up: (..., 3) world direction that should appear upwards in the image.
-
-    Returns:
-        (..., 4, 4) world to camera.
-
-    Raises:
-        ValueError: `eye` equals `target`, or `up` is parallel to the viewing direction.
+    All are in the world frame; ValueError where `eye` equals `target`, or `up` is parallel to the viewing direction.
     """
     xp = _library(eye)
     forward = target - eye

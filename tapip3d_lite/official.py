@@ -58,15 +58,9 @@ _REQUIRED = {  # options that we have in one value only
     "use_local_pos_input": (False,),
     "relative": (False,),
 }
-_IGNORED = {  # without meaning for inference, or restated by other options
-    "image_size",
-    "eval_mode",
-    "scale_aug",
-    "find_knn_in_normalized_space",
-    "encoder.pretrained",
-    "encoder.freeze_mode",
-    "point_updater.input_dim",
-}
+# Without meaning for inference, or restated by other options.
+_IGNORED = {"image_size", "eval_mode", "scale_aug", "find_knn_in_normalized_space", "point_updater.input_dim"}
+_IGNORED |= {"encoder.pretrained", "encoder.freeze_mode"}
 
 
 def load_official(path: str | Path, fast: bool = True) -> Tracker:
@@ -103,15 +97,13 @@ def from_official_state(cfg: Mapping[str, Any], state: Mapping[str, Tensor], fas
     tracker = Tracker(official_config(cfg), fast)
     state = dict(state)
     _check_time(tracker, state.pop("time_emb", None))
-    names = parameter_names(tracker)
-    own = tracker.state_dict()
+    names, own = parameter_names(tracker), tracker.state_dict()
     missing, unknown = sorted(set(names) - set(state)), sorted(set(state) - set(names))
     if missing or unknown:
         raise ValueError(
             f"state: missing parameters: {', '.join(missing) or 'none'}; unknown parameters: {', '.join(unknown) or 'none'}"
         )
-    values = {ours: _fit(theirs, state[theirs], own[ours]) for theirs, ours in names.items()}
-    tracker.load_state_dict(values)
+    tracker.load_state_dict({ours: _fit(theirs, state[theirs], own[ours]) for theirs, ours in names.items()})
     return tracker.eval()
 
 
@@ -196,16 +188,10 @@ def _fit(name: str, value: Tensor, own: Tensor) -> Tensor:
 
 
 def _check_time(tracker: Tracker, value: Tensor | None) -> None:
-    expected = time_embedding(*tracker.time.shape)
-    if (
-        value is None
-        or value.shape[1:] != expected.shape
-        or not torch.allclose(value[0].float().cpu(), expected, atol=1e-5)
-    ):
-        got = "nothing" if value is None else f"shape {tuple(value.shape)}"
-        raise ValueError(
-            f"state['time_emb']: expected sinusoids of shape (1, {', '.join(map(str, expected.shape))}), got {got}"
-        )
+    expected = time_embedding(*tracker.time.shape)[None]
+    got = "nothing" if value is None else f"shape {tuple(value.shape)}"
+    if value is None or value.shape != expected.shape or not torch.allclose(value.float().cpu(), expected, atol=1e-5):
+        raise ValueError(f"state['time_emb']: expected sinusoids of shape {tuple(expected.shape)}, got {got}")
 
 
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
 
 import torch
 from torch import Tensor, nn
 
+from tapip3d_lite.model.blocks import Block, Pool
 from tapip3d_lite.model.n2n import N2N
 from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.windows import Window, to_world
@@ -92,23 +92,17 @@ class Recorder:
         self.tracker.update = self._watch
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         del self.tracker.update
 
     def _watch(self, window: Window, coords: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-        tokens: list[Tensor] = []
-
-        def keep(_: nn.Module, inputs: tuple[Tensor, ...]) -> None:
-            tokens.append(inputs[0])
-
-        handle = self.tracker.updater.register_forward_pre_hook(keep)
+        inputs = []
+        handle = self.tracker.updater.register_forward_pre_hook(lambda _, given: inputs.append(given[0]))
         try:
             after = self._update(window, coords, logits)
         finally:
             handle.remove()
-        self._record(window, coords, after, tokens[0])
+        self._record(window, coords, after, inputs[0])
         return after
 
     @torch.no_grad()
@@ -140,32 +134,35 @@ class Recorder:
 def _look_at_n2n(context: N2N, index: int, kept: Tensor, near: Neighbors) -> dict[str, Tensor]:
     pair = context.pairs[index % len(context.pairs)]
     tokens = near.features + context.embed.offset(index, near.offsets)  # (S, n, K, D)
-    support = kept[:, : kept.shape[1] - context.use_features]
-    both = support.expand(len(tokens), -1, -1, -1)
-    ways = pair.support_from_context, pair.context_from_support
-    bags = ways[0](both, tokens), ways[1](tokens, both)
-    looks = (
-        way.attention.weights(way.norm(x), way.norm_context(y)).mean(-3)
-        for way, x, y in zip(ways, (both, tokens), (tokens, both), strict=True)
-    )
-    pools = (
-        pool.attention.weights(pool.token.expand(*bag.shape[:-2], -1, -1), bag).mean(-3).squeeze(-2)
-        for pool, bag in zip((pair.pool_support, pair.pool_context), bags, strict=True)
-    )
-    names = "support_from_context", "context_from_support", "pool_support", "pool_context"
-    weights = dict(zip(names, (*looks, *pools), strict=True))
-    return weights | {"support_tokens": support, "context_tokens": tokens}
+    support = kept[:, : kept.shape[1] - context.use_features]  # (n, K + 1, D)
+    both = support.expand(len(tokens), -1, -1, -1)  # (S, n, K + 1, D)
+    return {
+        "support_from_context": _looks(pair.support_from_context, both, tokens),
+        "context_from_support": _looks(pair.context_from_support, tokens, both),
+        "pool_support": _pooled(pair.pool_support, pair.support_from_context(both, tokens)),
+        "pool_context": _pooled(pair.pool_context, pair.context_from_support(tokens, both)),
+        "support_tokens": support,
+        "context_tokens": tokens,
+    }
 
 
 def _look_at_p2n(context: P2N, index: int, kept: Tensor, near: Neighbors) -> dict[str, Tensor]:
-    look = context.looks[index % len(context.looks)]
     tokens = near.features + context.embed.offset(index, near.offsets)  # (S, n, K, D)
-    query = kept[:, None].expand(len(tokens), -1, -1, -1)
-    weights = look.attention.weights(look.norm(query), look.norm_context(tokens)).mean(-3).squeeze(-2)
+    query = kept[:, None].expand(len(tokens), -1, -1, -1)  # (S, n, 1, D)
+    weights = _looks(context.looks[index % len(context.looks)], query, tokens).squeeze(-2)
     return {"query_from_context": weights, "support_tokens": kept[:, None], "context_tokens": tokens}
+
+
+def _looks(block: Block, x: Tensor, context: Tensor) -> Tensor:
+    """How tokens x (..., X, D) look at their context (..., Y, D): (..., X, Y), the mean over heads."""
+    return block.attention.weights(block.norm(x), block.norm_context(context)).mean(-3)
+
+
+def _pooled(pool: Pool, bag: Tensor) -> Tensor:
+    """Weights (..., X) of the pooling of a bag (..., X, D), the mean over heads."""
+    return pool.attention.weights(pool.token.expand(*bag.shape[:-2], -1, -1), bag).mean(-3).squeeze(-2)
 
 
 def _first(near: Neighbors) -> Neighbors:
     """The only clip of a batch."""
-    indices = None if near.indices is None else near.indices[0]
-    return Neighbors(near.features[0], near.points[0], near.center[0], indices)
+    return Neighbors(*(value if value is None else value[0] for value in vars(near).values()))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from tapip3d_lite.evaluation.baselines import KltTracker, StaticTracker, TrackerLike
+from tapip3d_lite.evaluation.baselines import Baseline, KltTracker, StaticTracker, TrackerLike
 from tapip3d_lite.files import shipped_weights
 
 _BASELINES = {"static": StaticTracker, "klt": KltTracker}
@@ -26,13 +27,22 @@ def load_tracker(name: str | Path = "lite", device: str = "cpu", fast: bool = Tr
     Raises:
         ValueError: neither a known name nor a file.
     """
-    if str(name) in _BASELINES:
-        return _BASELINES[str(name)]()
-    path = shipped_weights().get(str(name), Path(name))
+    name = str(name)
+    if name in _BASELINES:
+        return _BASELINES[name]()
+    path = shipped_weights().get(name, Path(name))
     if not path.is_file():
-        raise ValueError(
-            f"load_tracker: no tracker {str(name)!r}; choose {', '.join(list_trackers())} or a weights file"
-        )
+        raise ValueError(f"load_tracker: no tracker {name!r}; choose {', '.join(list_trackers())} or a weights file")
     from tapip3d_lite.model.weights import load_weights
 
     return load_weights(path, device, fast)
+
+
+def tracker_runs(names: Sequence[str], spaces: Sequence[str], device: str = "cpu") -> Iterator[tuple]:
+    """(label, tracker, options of `track`) of trackers by name: `klt`, and of learnt ones each space, `lite · world`."""
+    for name in names:
+        tracker = load_tracker(name, device)
+        if isinstance(tracker, Baseline):
+            yield str(name), tracker, {}
+        else:
+            yield from ((f"{Path(name).with_suffix('')} · {space}", tracker, {"space": space}) for space in spaces)

@@ -33,17 +33,13 @@ def check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
         )
 
 
-def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(expected) and all(e is None or s == e for s, e in zip(shape, expected, strict=True))
-
-
 def floats(name: str, value: object, shape: tuple[int | None, ...], finite: bool = False, like: str = "") -> np.ndarray:
     """`value` as float32 of the given shape (None: any length), or ValueError; `finite` refuses NaN and infinity."""
     array = np.asarray(value)
     wanted = "(" + ", ".join("N" if s is None else str(s) for s in shape) + ")" + (f" to match {like}" if like else "")
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name}: expected numbers of shape {wanted}, got dtype {array.dtype}; convert to float32")
-    if not _fits(array.shape, shape):
+    if array.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, array.shape, strict=True)):
         raise ValueError(f"{name}: expected shape {wanted}, got {array.shape}; reorder or resize the axes")
     array = array.astype(np.float32, copy=False)
     if finite and not np.isfinite(array).all():

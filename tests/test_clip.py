@@ -205,7 +205,7 @@ def bad_files(folder):
         ("rgb_only.npz", "depths, intrinsics, extrinsics missing"),
         ("scalar.npz", "Clip.video"),
         ("foreign.npz", "missing"),
-        ("halftracks.npz", "visible and query_point"),
+        ("halftracks.npz", "visible, query_point missing"),
     ],
 )
 def test_bad_files_are_value_errors(tmp_path, name, message):

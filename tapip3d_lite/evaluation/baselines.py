@@ -1,13 +1,9 @@
-"""Baselines without learning: zero motion, and pyramidal Lucas-Kanade lifted by depth.
-
-Both take the same arguments as the learnt tracker's `track`. Those that concern only the model (`space`, `iterations`,
-`support_grid`, `depth_roi`, `visible_threshold`) are accepted and ignored.
-"""
+"""Baselines without learning: zero motion, and pyramidal Lucas-Kanade lifted by depth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -18,35 +14,14 @@ from tapip3d_lite.queries import resolve_queries
 
 
 class TrackerLike(Protocol):
-    """The interface that all trackers share, learnt or not."""
+    """Any tracker, learnt or not; the options are those of `model.track.track`."""
 
-    def track(
-        self,
-        clip: Clip,
-        queries: np.ndarray | None = None,
-        space: str | None = None,
-        iterations: int | None = None,
-        support_grid: int | None = None,
-        bidirectional: bool = True,
-        depth_roi: str | tuple[float, float] | None = "auto",
-        visible_threshold: float | None = None,
-        progress: bool = False,
-    ) -> Tracks:
+    def track(self, clip: Clip, queries: np.ndarray | None = None, **options: Any) -> Tracks:
         """3D tracks of `queries` (N, 4), of the clip's own queries, or of a grid on the first frame."""
 
 
-@dataclass(frozen=True)
-class StaticTracker:
-    """Zero motion in the world: every point stays at its query.
-
-    A point counts as visible where it projects inside the image and the depth map shows a surface there, neither in
-    front of it (it is hidden) nor behind it (whatever the query lay on has moved away).
-
-    Attributes:
-        slack: relative depth difference up to which the surface at the pixel counts as the point.
-    """
-
-    slack: float = 0.02
+class Baseline:
+    """Takes the arguments of a learnt tracker's `track`, ignores those that concern only the model, and calls `_follow`."""
 
     def track(
         self,
@@ -60,16 +35,35 @@ class StaticTracker:
         visible_threshold: float | None = None,
         progress: bool = False,
     ) -> Tracks:
-        """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid; other options are ignored."""
-        queries = resolve_queries(clip, queries)
+        """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid.
+
+        With `bidirectional=False` Lucas-Kanade holds a point still and counts it as hidden before its query.
+        """
+        return self._follow(clip, resolve_queries(clip, queries), bidirectional)
+
+
+@dataclass(frozen=True)
+class StaticTracker(Baseline):
+    """Zero motion in the world: every point stays at its query.
+
+    A point counts as visible where it projects inside the image and the depth map shows a surface there, neither in
+    front of it (it is hidden) nor behind it (whatever the query lay on has moved away).
+
+    Attributes:
+        slack: relative depth difference up to which the surface at the pixel counts as the point.
+    """
+
+    slack: float = 0.02
+
+    def _follow(self, clip: Clip, queries: np.ndarray, _bidirectional: bool) -> Tracks:
         xyz = np.repeat(queries[None, :, 1:], len(clip), 0)
         uv, z = project(xyz, clip.intrinsics, clip.extrinsics)
-        surface, inside = _depth_at(clip, uv)
+        surface, inside = _depth_at(clip, uv, np.arange(len(clip)))
         return Tracks(xyz, inside & (z > 0) & (np.abs(z - surface) <= self.slack * z), queries)
 
 
 @dataclass(frozen=True)
-class KltTracker:
+class KltTracker(Baseline):
     """OpenCV's pyramidal Lucas-Kanade in the image, lifted by depth, with a forward-backward check for visibility.
 
     From its query frame each point is followed forward and backward in time, frame by frame. The search starts where
@@ -90,24 +84,8 @@ class KltTracker:
     tolerance: float = 1.0
     jump: float = 0.1
 
-    def track(
-        self,
-        clip: Clip,
-        queries: np.ndarray | None = None,
-        space: str | None = None,
-        iterations: int | None = None,
-        support_grid: int | None = None,
-        bidirectional: bool = True,
-        depth_roi: str | tuple[float, float] | None = None,
-        visible_threshold: float | None = None,
-        progress: bool = False,
-    ) -> Tracks:
-        """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid.
-
-        With `bidirectional=False` a point stands still and counts as hidden before its query; other options are
-        ignored.
-        """
-        paths = _Paths(clip, resolve_queries(clip, queries))
+    def _follow(self, clip: Clip, queries: np.ndarray, bidirectional: bool) -> Tracks:
+        paths = _Paths(clip, queries)
         for step in (1, -1) if bidirectional else (1,):
             last = paths.start.copy()  # (N,) the frame where each point was last seen in this direction
             for t in range(len(clip))[::step][1:]:
@@ -134,11 +112,8 @@ class KltTracker:
 
     def _flow(self, paths: _Paths, a: int, b: int, which: np.ndarray, guess: np.ndarray) -> tuple:
         """Pixels (n, 2) in frame b of the points `which` of frame a, and whether (n,) the way back returns."""
-        options = {
-            "winSize": (self.window, self.window),
-            "maxLevel": self.levels,
-            "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        }
+        size, flags = (self.window, self.window), cv2.OPTFLOW_USE_INITIAL_FLOW
+        options = {"winSize": size, "maxLevel": self.levels, "flags": flags}
         here, guess = paths.uv[a, which], guess.astype(np.float32)
         there, out, _ = cv2.calcOpticalFlowPyrLK(paths.gray[a], paths.gray[b], here, guess.copy(), **options)
         # The backward search starts as far from its target as the forward search did, else it would return trivially.
@@ -164,14 +139,13 @@ class _Paths:
         self.uv[at], self.world[at], self.seen[at] = uv[:, 0], queries[:, 1:], True
 
 
-def _depth_at(clip: Clip, uv: np.ndarray, frames: list[int] | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Depth at the nearest pixel (T, N), 0 outside, and whether (T, N) the pixel is inside the image."""
+def _depth_at(clip: Clip, uv: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth at the pixel nearest to uv (F, N, 2) in `frames` (F,), 0 outside; and whether (F, N) it is inside."""
     height, width = clip.size
     nearest = np.rint(np.nan_to_num(uv, nan=-1e6, posinf=-1e6, neginf=-1e6)).clip(-1, 1e6).astype(int)
     inside = ((nearest >= 0) & (nearest < (width, height))).all(-1)
-    t = np.arange(len(clip)) if frames is None else np.array(frames)
     u, v = np.where(inside[..., None], nearest, 0).transpose(2, 0, 1)
-    return np.where(inside, clip.depths[t[:, None], v, u], 0), inside
+    return np.where(inside, clip.depths[frames[:, None], v, u], 0), inside
 
 
 def _nearest_depth(clip: Clip, frame: int, uv: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -180,11 +154,10 @@ def _nearest_depth(clip: Clip, frame: int, uv: np.ndarray, expected: np.ndarray)
     At a silhouette the pixel itself often belongs to what lies behind.
     """
     steps = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(9, 1, 2)
-    _, inside = _depth_at(clip, uv[None], frames=[frame])
-    around = np.concatenate([_depth_at(clip, (uv + step)[None], frames=[frame])[0] for step in steps])
+    around, inside = _depth_at(clip, uv + steps, np.full(9, frame))  # (9, N)
     around = np.where(around > 0, around, np.inf)
     best = np.abs(around - expected).argmin(0)
-    return around[best, np.arange(len(uv))], inside[0]
+    return around[best, np.arange(len(uv))], inside[4]  # the middle one
 
 
 def _filled(world: np.ndarray, alive: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from tapip3d_lite.evaluation.metrics import scale_factor, tapvid2d_metrics, tapv
 from tapip3d_lite.geometry import RASTER, project, transform
 
 
-def evaluate(pred: Tracks, clip: Clip, truth: Tracks | None = None) -> dict[str, float]:
+def evaluate(pred: Tracks, clip: Clip) -> dict[str, float]:
     """Scores of predicted tracks on a clip with truth.
 
     3D scores follow TAPVid-3D: camera frame, intrinsics scaled by 256 / min(H, W), all frames. `AJ3D` and `APD3D` use
@@ -21,8 +21,7 @@ def evaluate(pred: Tracks, clip: Clip, truth: Tracks | None = None) -> dict[str,
 
     Args:
         pred: tracks of the truth's queries, in their order.
-        clip: provides the cameras, and the truth unless one is given.
-        truth: in place of `clip.tracks`, e.g. `clip.tracks.select(mask)`.
+        clip: provides the cameras and the truth, `clip.tracks`.
 
     Returns:
         `AJ3D, APD3D, OA, AJ2D, APD2D, AJ3D_none, APD3D_none, EPE` (mean 3D error over visible truth, scene units) and
@@ -31,14 +30,11 @@ def evaluate(pred: Tracks, clip: Clip, truth: Tracks | None = None) -> dict[str,
     Raises:
         ValueError: the clip has no truth, or the prediction follows other queries.
     """
-    truth = clip.tracks if truth is None else truth
+    truth = clip.tracks
     if truth is None:
         raise ValueError(f"evaluate: clip {clip.name!r} has no true tracks; simulate one or load a file with tracks")
-    for name, tracks in (("truth", truth), ("pred", pred)):
-        if len(tracks.xyz) != len(clip):
-            raise ValueError(
-                f"{name}: expected {len(clip)} frames as in the clip, got {len(tracks.xyz)}; cut both alike"
-            )
+    if len(pred.xyz) != len(clip):
+        raise ValueError(f"pred: expected {len(clip)} frames as in the clip, got {len(pred.xyz)}; cut both alike")
     if pred.queries.shape != truth.queries.shape or not np.allclose(pred.queries, truth.queries, atol=1e-4):
         raise ValueError(
             f"evaluate: the prediction follows {pred.queries.shape[0]} queries that are not the {truth.queries.shape[0]} "
@@ -84,9 +80,11 @@ def score_table(
     rows: Mapping[str, Mapping[str, float]], metrics: Sequence[str] = ("AJ3D", "APD3D", "OA", "AJ3D_none", "APD3D_none")
 ) -> str:
     """A Markdown table, one row an entry, three decimals, nan where an entry lacks a metric."""
-    lines = ["| | " + " | ".join(metrics) + " |", "|---" * (len(metrics) + 1) + "|"]
-    lines += [
-        f"| {name} | " + " | ".join(f"{row.get(m, float('nan')):.3f}" for m in metrics) + " |"
-        for name, row in rows.items()
-    ]
-    return "\n".join(lines)
+    cells = ([name, *(f"{row.get(m, float('nan')):.3f}" for m in metrics)] for name, row in rows.items())
+    return markdown_table(["", *metrics], cells)
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table of cells."""
+    lines = ["".join(f"| {cell} " if cell else "| " for cell in row) + "|" for row in (head, *rows)]
+    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])

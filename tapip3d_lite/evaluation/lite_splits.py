@@ -16,54 +16,21 @@ import numpy as np
 from tqdm import tqdm
 
 from tapip3d_lite.clip import Clip, load_clip
-from tapip3d_lite.simulate import Rollout, SimulationConfig, render_clip, simulate_rollout
+from tapip3d_lite.simulate import Rollout, render_clip
 from tapip3d_lite.simulate.dataset import run_jobs
-from tapip3d_lite.simulate.rollout import load_rollouts, save_rollouts
-from tapip3d_lite.simulate.seeds import BENCHMARK
+from tapip3d_lite.simulate.rollout import load_rollouts
 
 FOLDER = Path(__file__).parent / "lite_benchmark"
 SPLITS = ("static-camera", "moving-camera", "occlusion")
 COUNT = 16
+Job = tuple[Path, str, Rollout, dict[str, np.ndarray]]  # file in the cache, name, what to render, fingerprint
 SLACK = {"tracks": 2, "depths": 4, "visible": 0, "video": 4}  # millimetres, millimetres, bits, grey levels
 
 
-def split_config(split: str, index: int) -> SimulationConfig:
-    """The settings of a split's clip; its seed is `split_seed`.
-
-    Raises:
-        ValueError: unknown split.
-    """
-    check_split(split)
-    if split == "static-camera":
-        return SimulationConfig(camera="static")
-    if split == "moving-camera":
-        return SimulationConfig(camera=("linear", "arc", "handheld")[index % 3], handheld=2.0)
-    camera = ("static", "linear", "arc", "handheld")[index % 4]
-    return SimulationConfig(camera=camera, occluder=True, moving=(8, 12), resting=(2, 6), speed=1.4)
-
-
-def split_seed(split: str, index: int) -> int:
-    """The seed of a split's clip: the splits take successive seeds from a thousand each."""
-    check_split(split)
-    return BENCHMARK.start + 1000 * SPLITS.index(split) + index
-
-
 def check_split(split: str) -> None:
-    """Refuse an unknown split.
-
-    Raises:
-        ValueError: it is none of `SPLITS`.
-    """
+    """Raise ValueError for a split that is none of `SPLITS`."""
     if split not in SPLITS:
         raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split!r}; choose one of them")
-
-
-def write_split(split: str, folder: str | Path = FOLDER, count: int = COUNT) -> Path:
-    """Simulate a split again and store it, for maintainers only: the benchmark's scores change with it."""
-    rollouts = [simulate_rollout(split_seed(split, index), split_config(split, index)) for index in range(count)]
-    path = Path(folder) / f"{split}.npz"
-    save_rollouts(path, rollouts, [fingerprint(render_clip(rollout)) for rollout in rollouts])
-    return path
 
 
 def fingerprint(clip: Clip) -> dict[str, np.ndarray]:
@@ -77,38 +44,24 @@ def fingerprint(clip: Clip) -> dict[str, np.ndarray]:
     }
 
 
-def differences(clip: Clip, stored: dict[str, np.ndarray], share: float = 0.01) -> list[str]:
-    """What differs between a clip and a fingerprint, apart from rounding and a share of pixels at edges of bodies."""
+def differences(clip: Clip, stored: dict[str, np.ndarray]) -> list[str]:
+    """What differs between a clip and a fingerprint, apart from rounding and a hundredth of pixels, at edges of bodies."""
     found = []
     for name, now in fingerprint(clip).items():
         if now.shape != stored[name].shape:
             found.append(f"{name}: shape {now.shape} in place of {stored[name].shape}")
             continue
         other = (np.abs(now.astype(int) - stored[name].astype(int)) > SLACK[name]).mean()
-        if other > share:
+        if other > 0.01:
             found.append(f"{name}: {other:.1%} of the values differ")
     return found
 
 
-def benchmark_clips(
-    split: str,
-    count: int | None = None,
-    cache: str | Path | None = None,
-    workers: int | None = None,
-    progress: bool = True,
-    folder: str | Path = FOLDER,
-) -> list[Clip]:
-    """The clips of a split, named `<split>-<index>`; rendered on first use, then read from a cache.
+def benchmark_clips(split: str, count: int | None = None, progress: bool = True) -> list[Clip]:
+    """The clips of a split, or only the first `count`, named `<split>-<index>`.
 
-    A script that calls this with several workers needs the usual `if __name__ == "__main__":`.
-
-    Args:
-        split: one of `SPLITS`.
-        count: only the first so many clips.
-        cache: folder for the rendered clips (1 MB each); `cache_folder()` if None.
-        workers: processes; None for one per core.
-        progress: show a bar while rendering.
-        folder: of the stored rollouts.
+    They are rendered on first use by all cores (a script that calls this needs the usual `if __name__ == "__main__":`),
+    then read from a cache of 1 MB a clip: `$XDG_CACHE_HOME/tapip3d_lite/benchmark`, by default under `~/.cache`.
 
     Raises:
         ValueError: unknown split, bad count, or rendered clips that differ from the fingerprints.
@@ -116,26 +69,19 @@ def benchmark_clips(
     check_split(split)
     if count is not None and count < 1:
         raise ValueError(f"benchmark_clips: count must be at least 1, got {count}; leave it out for all clips")
-    path, cache = Path(folder) / f"{split}.npz", Path(cache or cache_folder())
-    stored, key = load_rollouts(path)[:count], _key(path)
+    path = FOLDER / f"{split}.npz"
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tapip3d_lite" / "benchmark"
+    key = _key(path)
     jobs = [
         (cache / f"{split}-{index:02d}-{key}.npz", f"{split}-{index:02d}", rollout, marks)
-        for index, (rollout, marks) in enumerate(stored)
+        for index, (rollout, marks) in enumerate(load_rollouts(path)[:count])
     ]
     clips = {job[1]: _cached(job) for job in jobs}
     missing = [job for job in jobs if clips[job[1]] is None]
     with tqdm(total=len(missing), desc="rendering", unit="clip", disable=not (progress and missing)) as bar:
-        for _ in run_jobs(_render, missing, workers):
+        for _ in run_jobs(_render, missing):
             bar.update()
     return [clips[job[1]] or load_clip(job[0]) for job in jobs]
-
-
-def cache_folder() -> Path:
-    """The folder of rendered clips: `$XDG_CACHE_HOME/tapip3d_lite/benchmark`, by default under `~/.cache`."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tapip3d_lite" / "benchmark"
-
-
-Job = tuple[Path, str, Rollout, dict[str, np.ndarray]]
 
 
 def _key(path: Path) -> str:

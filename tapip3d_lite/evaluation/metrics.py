@@ -32,8 +32,7 @@ def tapvid3d_metrics(
     intrinsics: Array,
     queries: Array | None = None,
     scaling: str = "median",
-    per_track: bool = False,
-) -> dict[str, float | Array]:
+) -> dict[str, float]:
     """TAPVid-3D metrics of one video.
 
     Args:
@@ -44,7 +43,6 @@ def tapvid3d_metrics(
         intrinsics: (T, 3, 3) or (3, 3), used as given (the benchmark scales them by 256 / min(H, W) first).
         queries: (N, 4) rows (t, ...) or (N,) query frames; needed by `per_trajectory` and `median_on_queries`.
         scaling: how the prediction's scale is matched to the truth before scoring, one of `SCALINGS`.
-        per_track: return arrays (N,), each track scored alone (with the video's common scale), instead of numbers.
 
     Returns:
         `AJ3D`, `APD3D`, `OA` and for each k `jaccard_k`, `within_k`: fractions in [0, 1], NaN where undefined.
@@ -52,8 +50,7 @@ def tapvid3d_metrics(
     Raises:
         ValueError: shapes that do not fit, an unknown scaling, or queries missing where the scaling needs them.
     """
-    p, q = np.asarray(gt_xyz, np.float64), np.asarray(xyz, np.float64)
-    v, w = _checked(p, gt_visible, q, visible, 3)
+    p, v, q, w = _checked(gt_xyz, gt_visible, xyz, visible, 3)
     focal = np.asarray(intrinsics, np.float64)
     if focal.shape[-2:] != (3, 3) or focal.ndim not in (2, 3) or (focal.ndim == 3 and len(focal) != len(p)):
         raise ValueError(f"intrinsics: expected ({len(p)}, 3, 3) or (3, 3), got {focal.shape}")
@@ -66,7 +63,7 @@ def tapvid3d_metrics(
     with np.errstate(invalid="ignore", over="ignore"):
         squared = ((scale * q - p) ** 2).sum(-1)
         inside = {k: squared < (k * pixel) ** 2 for k in THRESHOLDS}
-    return _scores(inside, v, w, np.ones_like(v), "3D", per_track)
+    return _scores(inside, v, w, np.ones_like(v), "3D")
 
 
 def tapvid2d_metrics(
@@ -76,8 +73,7 @@ def tapvid2d_metrics(
     visible: Array,
     queries: Array,
     mode: str = "first",
-    per_track: bool = False,
-) -> dict[str, float | Array]:
+) -> dict[str, float]:
     """TAP-Vid metrics of one video.
 
     Args:
@@ -87,7 +83,6 @@ def tapvid2d_metrics(
         visible: (T, N) bool.
         queries: (N, 3 or 4) rows (t, ...) or (N,) query frames.
         mode: `"first"` scores frames after the query, `"strided"` all but the query frame.
-        per_track: return arrays (N,) instead of numbers.
 
     Returns:
         `AJ2D`, `APD2D`, `OA`, `jaccard_k`, `within_k`; fractions, NaN where undefined.
@@ -95,8 +90,7 @@ def tapvid2d_metrics(
     Raises:
         ValueError: shapes that do not fit, or an unknown mode.
     """
-    p, q = np.asarray(gt_uv, np.float64), np.asarray(uv, np.float64)
-    v, w = _checked(p, gt_visible, q, visible, 2)
+    p, v, q, w = _checked(gt_uv, gt_visible, uv, visible, 2)
     if mode not in MODES:
         raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
     t, start = np.arange(len(p))[:, None], _query_frames(queries, p.shape[:2])
@@ -106,24 +100,14 @@ def tapvid2d_metrics(
     with np.errstate(invalid="ignore", over="ignore"):
         squared = ((q - p) ** 2).sum(-1)
         inside = {k: squared < k**2 for k in THRESHOLDS}
-    return _scores(inside, v, w, scored, "2D", per_track)
+    return _scores(inside, v, w, scored, "2D")
 
 
 def scale_factor(p: Array, q: Array, both: Array, start: Array | None, scaling: str) -> Array | float:
-    """The factor that multiplies the prediction before it is scored.
+    """The factor that multiplies predictions q (T, N, 3) before they are compared with the truth p (T, N, 3).
 
-    Args:
-        p: (T, N, 3) true points, camera frame.
-        q: (T, N, 3) predicted points, camera frame.
-        both: (T, N) bool, where truth and prediction are visible.
-        start: (N,) query frames, or None where the scaling does not need them.
-        scaling: one of `SCALINGS`.
-
-    Returns:
-        A number, (1, N, 1) or (T, N, 1); NaN where nothing is visible in both, so that every point is a miss.
-
-    Raises:
-        ValueError: unknown scaling, or `start` missing.
+    `both` (T, N) says where both are visible; `start` (N,) are the query frames, or None where the scaling needs none
+    (else ValueError). A number, (1, N, 1) or (T, N, 1); NaN where nothing is visible in both: every point is a miss.
     """
     if scaling not in SCALINGS:
         raise ValueError(f"scaling: expected one of {', '.join(SCALINGS)}, got {scaling!r}")
@@ -144,23 +128,21 @@ def scale_factor(p: Array, q: Array, both: Array, start: Array | None, scaling: 
     return _norm_ratio(p, q, both & at_query, np.nanmedian)
 
 
-def _scores(inside: dict[int, Array], v: Array, w: Array, scored: Array, suffix: str, per_track: bool) -> dict:
-    axis = 0 if per_track else None
-    scores = {"OA": _ratio(((v == w) & scored).sum(axis), scored.sum(axis))}
-    visible = (v & scored).sum(axis)
+def _scores(inside: dict[int, Array], v: Array, w: Array, scored: Array, suffix: str) -> dict[str, float]:
+    scores = {"OA": _ratio(((v == w) & scored).sum(), scored.sum())}
+    visible = (v & scored).sum()
     for k, hit in inside.items():
         true = hit & v & scored
-        scores[f"within_{k}"] = _ratio(true.sum(axis), visible)
-        claimed_wrongly = (w & ~true & scored).sum(axis)
-        scores[f"jaccard_{k}"] = _ratio((true & w).sum(axis), visible + claimed_wrongly)
+        scores[f"within_{k}"] = _ratio(true.sum(), visible)
+        claimed_wrongly = (w & ~true & scored).sum()
+        scores[f"jaccard_{k}"] = _ratio((true & w).sum(), visible + claimed_wrongly)
     for name, part in ((f"AJ{suffix}", "jaccard"), (f"APD{suffix}", "within")):
-        scores[name] = np.mean([scores[f"{part}_{k}"] for k in inside], axis=0)
-    return scores if per_track else {name: float(value) for name, value in scores.items()}
+        scores[name] = float(np.mean([scores[f"{part}_{k}"] for k in inside]))
+    return scores
 
 
-def _ratio(numerator: Array, denominator: Array) -> Array:
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(denominator > 0, numerator / np.maximum(denominator, 1), np.nan)
+def _ratio(numerator: int, denominator: int) -> float:
+    return float(numerator / denominator) if denominator else np.nan
 
 
 def _norm_ratio(p: Array, q: Array, where: Array, average: Callable[[Array], float]) -> float:
@@ -184,8 +166,8 @@ def _query_frames(queries: Array | None, shape: tuple[int, int]) -> Array | None
     return frames.astype(int)
 
 
-def _checked(p: Array, v: Array, q: Array, w: Array, last: int) -> tuple[Array, Array]:
-    v, w = np.asarray(v), np.asarray(w)
+def _checked(p: Array, v: Array, q: Array, w: Array, last: int) -> tuple[Array, Array, Array, Array]:
+    p, v, q, w = np.asarray(p, np.float64), np.asarray(v), np.asarray(q, np.float64), np.asarray(w)
     if p.ndim != 3 or p.shape[-1] != last:
         raise ValueError(f"truth: expected (T, N, {last}), got {p.shape}; time comes first")
     if q.shape != p.shape:
@@ -193,4 +175,4 @@ def _checked(p: Array, v: Array, q: Array, w: Array, last: int) -> tuple[Array, 
     for name, flags in (("gt_visible", v), ("visible", w)):
         if flags.shape != p.shape[:2] or flags.dtype != bool:
             raise ValueError(f"{name}: expected {p.shape[:2]} bool, got {flags.shape} {flags.dtype}")
-    return v, w
+    return p, v, q, w

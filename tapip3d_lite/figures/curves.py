@@ -26,7 +26,7 @@ def score_figure(
     """Dots with 95 % bootstrap intervals over clips: one panel a split, filled for all points, hollow for dynamic ones.
 
     Args:
-        results: from `score_trackers` or `load_results`.
+        results: from `run_benchmark` or `load_results`.
         metrics: names without `_dynamic`.
         splits: those that no tracker was scored on are left out.
 

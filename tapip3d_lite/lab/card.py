@@ -11,7 +11,8 @@ from tapip3d_lite.training.augment import augmentations
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.run_folder import read_log
 
-_LIMITS = """- Trained on simulated clips of rigid bodies in rooms, at most {frames} frames an example and images of {height}x{width}
+_PARTS = {"All points": "", "Moving points": "_dynamic", "Points at rest": "_static"}
+_LIMITS = """- Trained on simulated clips of rigid bodies in rooms, at most {frames} frames an example and images of {size}
   pixels; on real footage, soft bodies or much longer clips this card measures nothing.
 - It expects metric or at least consistent depth, and poses; `check` finds the usual mix-ups.
 - Nothing is remembered beyond a window ({window} frames) but the estimate: a point hidden for longer may be lost.
@@ -26,21 +27,10 @@ def model_card(
     command: str | None = None,
     weights: str | Path | None = None,
 ) -> str:
-    """The model card of a finished training, in Markdown.
+    """The model card of a finished training, in Markdown; ValueError where a file is missing, unreadable or empty.
 
-    Args:
-        folder: of the training: `config.json`, `log.jsonl`, `weights.safetensors`.
-        results: JSON that `benchmark --out` wrote.
-        hardware: on which it was trained, in words.
-        name: of the model.
-        command: that made it; None: the one with this recipe's options.
-        weights: another file than the folder's own.
-
-    Returns:
-        The text.
-
-    Raises:
-        ValueError: a file is missing or unreadable, the log is empty, or there are no results.
+    `folder` holds `config.json`, `log.jsonl` and the weights, unless these lie elsewhere (`weights`); `results` is what
+    `benchmark --out` wrote. Files cannot know the `hardware`, nor a `command` that is to be shown beside the recipe.
     """
     folder = Path(folder)
     path = Path(weights) if weights else folder / "weights.safetensors"
@@ -52,31 +42,24 @@ def model_card(
         raise ValueError(
             f"card: expected steps in {folder / 'log.jsonl'} and scores in {results}; one of them is empty"
         )
-    command = command or f"python -m tapip3d_lite train --out runs/{name}{_flags(config)}"
     compared = [label for label in scores if any(split in scores[label] for split in SPLITS)]
+    trackers = " ".join(dict.fromkeys(label.rpartition(" · ")[0] or label for label in compared))  # not once a space
+    scoring = f"python -m tapip3d_lite benchmark --tracker {trackers} --space world camera --out {Path(results).name}"
     parts = [
         f"# Model card: `{name}`",
         _facts(config, log, path, hardware),
-        f"## Made by\n\n```\n{command}\npython -m tapip3d_lite benchmark --tracker {_trackers(compared)} "
-        f"--space world camera --out {Path(results).name}\n```",
+        "## Made by",
+        "\n".join(["```", *([command] if command else []), scoring, "```"]),
+        f"The recipe is that of the preset `{config.preset}`, with these values instead:",
+        f"```json\n{_changed(config)}\n```",
         "## Scores\n\nMeans with 95 % bootstrap intervals over clips of the Lite benchmark, whose seeds no training can draw.",
-        *(f"{title}:\n\n{_table(scores, part)}" for title, part in _PARTS.items()),
+        *(f"{title}:\n\n{summary_table(scores, [m + part for m in METRICS])}" for title, part in _PARTS.items()),
         *_differences(scores, compared, name),
     ]
-    return "\n\n".join([*parts, f"## Limits\n\n{_limits(config)}"]) + "\n"
-
-
-_PARTS = {"All points": "", "Moving points": "_dynamic", "Points at rest": "_static"}
-
-
-def _limits(config: TrainConfig) -> str:
     model = config.tracker_config()
-    height, width = model.image_size
-    return _LIMITS.format(frames=config.frames[1], height=height, width=width, window=model.window)
-
-
-def _table(scores: dict, part: str) -> str:
-    return summary_table(scores, tuple(metric + part for metric in METRICS))
+    size = "x".join(map(str, model.image_size))
+    limits = _LIMITS.format(frames=config.frames[1], size=size, window=model.window)
+    return "\n\n".join([*parts, f"## Limits\n\n{limits}"]) + "\n"
 
 
 def _differences(scores: dict, labels: list[str], name: str) -> list[str]:
@@ -91,31 +74,26 @@ def _differences(scores: dict, labels: list[str], name: str) -> list[str]:
 
 
 def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -> str:
-    model = load_weights(weights)
-    parameters = sum(p.numel() for p in model.parameters())
-    held_out = [line for line in log if "val_AJ3D_none" in line]
+    tracker, last = load_weights(weights), log[-1]
+    model, parameters = tracker.config, sum(p.numel() for p in tracker.parameters())
     rows = {
         "parameters": f"{parameters / 1e6:.2f} M, file {weights.stat().st_size / 1e6:.2f} MB",
-        "model": f"preset `{config.preset}`, images {model.config.image_size[0]}x{model.config.image_size[1]}, window "
-        f"{model.config.window}, K = {model.config.neighbors}, {model.config.levels} levels from stride {model.config.stride}"
-        + (f"; set by hand: {', '.join(f'{k}={v}' for k, v in config.tracker.items())}" if config.tracker else ""),
+        "model": f"preset `{config.preset}`, images {model.image_size[0]}x{model.image_size[1]}, window {model.window}, "
+        f"K = {model.neighbors}, {model.levels} levels from stride {model.stride}",
         "data": f"{config.clips} simulated clips; examples of {_range(config.frames)} frames and {config.sampling.tracks} "
         f"tracks; images {_changes(config)}",
         "steps": _steps(config, log),
         "recipe": f"AdamW {config.lr:g}, weight decay {config.weight_decay:g}, one cycle, M = {_range(config.iterations)}, "
-        f"{config.precision}, encoder {'trained along' if config.train_encoder else 'frozen after matching'}, seed {config.seed}"
-        + (f"; errors softened from {config.loss.soften:g} pixels on" if config.loss.soften else ""),
-        "wall-clock": f"{log[-1]['seconds'] / 3600:.2f} h of steps (evaluations and simulation not counted)",
+        f"{config.precision}, encoder {'trained along' if config.train_encoder else 'frozen after matching'}, seed {config.seed}",
+        "wall-clock": f"{last['seconds'] / 3600:.2f} h of steps (evaluations and simulation not counted)",
         "hardware": hardware,
-        "visible from": f"probability {model.config.visible_threshold:g}"
+        "visible from": f"probability {model.visible_threshold:g}"
         + (f" of being seen and within {config.loss.within:g} pixels" if config.loss.within else ""),
     }
+    held_out = [line for line in log if "val_AJ3D_none" in line]
     if held_out:
-        last = held_out[-1]
-        rows["held-out clips"] = (
-            f"AJ3D {last['val_AJ3D_none']:.3f}, APD3D {last['val_APD3D_none']:.3f}, OA {last['val_OA']:.3f} "
-            f"at step {last['step']} (unscaled, world, {config.validation} clips)"
-        )
+        scores = "AJ3D {val_AJ3D_none:.3f}, APD3D {val_APD3D_none:.3f}, OA {val_OA:.3f} at step {step}"
+        rows["held-out clips"] = scores.format(**held_out[-1]) + f" (unscaled, world, {config.validation} clips)"
     return "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows.items())
 
 
@@ -136,40 +114,7 @@ def _range(pair: tuple[int, int]) -> str:
     return str(pair[0]) if pair[0] == pair[1] else f"{pair[0]} to {pair[1]}"
 
 
-def _trackers(labels: list[str]) -> str:
-    """Names for `--tracker`, from labels of which a learnt tracker has one for each space."""
-    return " ".join(dict.fromkeys(label.rpartition(" · ")[0] or label for label in labels))
-
-
-def _flags(config: TrainConfig) -> str:
-    """Options for the fields in which the recipe differs from its preset's."""
-    default, own = TrainConfig.recipe(config.preset).to_dict(), config.to_dict()
-    flags = "" if config.preset == "lite" else f" --preset {config.preset}"
-    for name, value, usual in _leaves(own, default):
-        if name == "tracker":  # sizes of images cannot be given on the command line; the table names them
-            plain = [f"{k} {v}" for k, v in value.items() if not isinstance(v, list | tuple)]
-            flags += f" --tracker {' '.join(plain)}" if plain else ""
-        elif value != usual:
-            flags += (
-                f" --{name.replace('_', '-')} {_words(value)}" if not isinstance(value, bool) else _switch(name, value)
-            )
-    return flags
-
-
-def _leaves(own: dict, default: dict, prefix: str = "") -> list[tuple[str, object, object]]:
-    leaves = []
-    for name, value in own.items():
-        if isinstance(value, dict) and isinstance(default.get(name), dict) and name != "tracker":
-            leaves += _leaves(value, default[name], f"{prefix}{name}.")
-        else:
-            leaves.append((prefix + name, value, default.get(name)))
-    return leaves
-
-
-def _words(value: object) -> str:
-    return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def _switch(name: str, value: bool) -> str:
-    *path, last = name.replace("_", "-").split(".")
-    return f" --{'.'.join([*path, last if value else f'no-{last}'])}"
+def _changed(config: TrainConfig) -> str:
+    """What the recipe sets otherwise than its preset does, as JSON for `TrainConfig.from_dict`."""
+    usual = TrainConfig.recipe(config.preset).to_dict()
+    return json.dumps({name: value for name, value in config.to_dict().items() if value != usual[name]}, indent=1)

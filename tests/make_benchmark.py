@@ -1,0 +1,36 @@
+"""Make `evaluation/lite_benchmark/*.npz`, the stored clips of the Lite benchmark: `python -m tests.make_benchmark`.
+
+For maintainers only: the physics is simulated again, so every score of the benchmark changes with it.
+"""
+
+from __future__ import annotations
+
+from tapip3d_lite.evaluation.lite_splits import COUNT, FOLDER, SPLITS, fingerprint
+from tapip3d_lite.simulate import SimulationConfig, render_clip, simulate_rollout
+from tapip3d_lite.simulate.rollout import save_rollouts
+from tapip3d_lite.simulate.seeds import BENCHMARK
+
+
+def split_config(split: str, index: int) -> SimulationConfig:
+    """The settings of a split's clip; its seed is `split_seed`."""
+    if split == "static-camera":
+        return SimulationConfig(camera="static")
+    if split == "moving-camera":
+        return SimulationConfig(camera=("linear", "arc", "handheld")[index % 3], handheld=2.0)
+    camera = ("static", "linear", "arc", "handheld")[index % 4]
+    return SimulationConfig(camera=camera, occluder=True, moving=(8, 12), resting=(2, 6), speed=1.4)
+
+
+def split_seed(split: str, index: int) -> int:
+    """The seed of a split's clip: the splits take successive seeds from a thousand each."""
+    return BENCHMARK.start + 1000 * SPLITS.index(split) + index
+
+
+def write_split(split: str) -> None:
+    rollouts = [simulate_rollout(split_seed(split, index), split_config(split, index)) for index in range(COUNT)]
+    save_rollouts(FOLDER / f"{split}.npz", rollouts, [fingerprint(render_clip(rollout)) for rollout in rollouts])
+
+
+if __name__ == "__main__":
+    for split in SPLITS:
+        write_split(split)
