@@ -57,3 +57,12 @@ def bools(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
     if array.dtype != bool and not (array.dtype.kind in "iuf" and np.isin(array, (0, 1)).all()):
         raise ValueError(f"{name}: expected booleans, got dtype {array.dtype}; threshold it first")
     return array.astype(bool, copy=False)
+
+
+def check_range(config: object, low: float, high: float, *names: str) -> None:
+    """Raise ValueError unless these fields of a config, each a number or a tuple of numbers, are in [low, high]."""
+    for name in names:
+        value = getattr(config, name)
+        if not (low <= np.min(value) and np.max(value) <= high):
+            wanted = f"at least {low}" if high == np.inf else f"values in [{low}, {high}]"
+            raise ValueError(f"{type(config).__name__}.{name}: expected {wanted}, got {value}")

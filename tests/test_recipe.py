@@ -10,15 +10,13 @@ from torch import nn
 
 import tapip3d_lite as t3d
 from tapip3d_lite.training import schedule as clock
-from tapip3d_lite.training.accuracy import Accuracy
 from tapip3d_lite.training.data import make_batch
-from tapip3d_lite.training.loss import LossConfig
-from tapip3d_lite.training.optimizer import one_cycle
+from tapip3d_lite.training.loss import LossConfig, accuracy, step_accuracy
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.pretrain import MatchingConfig
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.run_folder import read_log
-from tapip3d_lite.training.schedule import Schedule
+from tapip3d_lite.training.schedule import Schedule, one_cycle
 from tapip3d_lite.training.trainer import Trainer
 from tests.tiny import SIZES, checkpoint, recipe
 
@@ -159,7 +157,7 @@ def test_accuracy_is_the_loop(clips):
     batch = make_batch([clip]).to("cpu")
     assert len({int(t) for t in clip.queries[:, 0]}) > 1 and 0 < int(batch.dynamic.sum()) < batch.dynamic.numel()
     tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **SIZES))
-    accuracy, rng = Accuracy(), np.random.default_rng(0)
+    totals, rng = torch.zeros(2, 2), np.random.default_rng(0)
     inside, counted = np.zeros(2), np.zeros(2)
     for step in tracker.steps(batch.frames, batch.queries, iterations=2):
         pixels = 2.0 ** rng.uniform(-1, 5, step.coords.shape[:3])[..., None]  # errors of half a pixel to 32
@@ -172,18 +170,32 @@ def test_accuracy_is_the_loop(clips):
             z = t3d.geometry.transform(xyz, clip.extrinsics[t])[:, 2]
             focal = np.sqrt(clip.intrinsics[t, 0, 0] * clip.intrinsics[t, 1, 1]) * 256 / 32
             moved[0, i] = xyz + direction[0, i] * (pixels[0, i, :, 0] * z / focal)[:, None]
-            if step.iteration == 0 or step.start + i > 5:
+            if step.start + i > 5:
                 continue
             for k, n in enumerate(step.columns.tolist()):
                 if clip.tracks.visible[t, n] and t >= clip.queries[n, 0]:
                     share = np.mean([pixels[0, i, k, 0] < limit for limit in (1, 2, 4, 8, 16)])
                     inside += share * np.array([1, clip.tracks.dynamic[n]])
                     counted += np.array([1, clip.tracks.dynamic[n]])
-        accuracy.add(replace(step, coords=torch.from_numpy(moved)), batch, 2)
-    np.testing.assert_allclose(accuracy.totals.numpy(), [inside, counted], rtol=1e-4)
-    result = Accuracy.result(accuracy.totals)
+        totals += step_accuracy(replace(step, coords=torch.from_numpy(moved)), batch.truth, batch.dynamic)
+    np.testing.assert_allclose(totals.numpy(), [inside, counted], rtol=1e-4)
+    result = accuracy(totals)
     assert result == pytest.approx({"apd": inside[0] / counted[0], "apd_dynamic": inside[1] / counted[1]}, rel=1e-4)
-    assert 0.2 < result["apd"] < 0.8 and Accuracy.result(torch.zeros(2, 2)) == {"apd": None, "apd_dynamic": None}
+    assert 0.2 < result["apd"] < 0.8 and accuracy(torch.zeros(2, 2)) == {"apd": None, "apd_dynamic": None}
+
+
+def test_the_log_has_the_accuracy_of_each_windows_last_update(tmp_path, clips, one_thread):
+    trainer = Trainer(tmp_path, recipe(matching_steps=0, frames=(8, 8), iterations=2, head=0.003), clips)
+    batch = trainer.examples.batch(0, 0).to("cpu")
+    steps = trainer.tracker.steps(
+        batch.frames, batch.queries, iterations=2, depth_roi=batch.roi, features=batch.features
+    )
+    totals = [torch.zeros(2, 2), torch.zeros(2, 2)]
+    for step in steps:
+        totals[step.iteration] += step_accuracy(step, batch.truth, batch.dynamic)
+    line = next(trainer.steps())
+    first, last = map(accuracy, totals)
+    assert {name: line[name] for name in last} == pytest.approx(last) and first != pytest.approx(last)
 
 
 def test_the_loss_is_the_recipes(tmp_path, clips, one_thread):

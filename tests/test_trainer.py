@@ -13,9 +13,10 @@ import torch
 
 import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
+from tapip3d_lite.files import load_npz
 from tapip3d_lite.lab import make_trainer
 from tapip3d_lite.training.augment import AugmentConfig
-from tapip3d_lite.training.data import SamplingConfig, load_part
+from tapip3d_lite.training.data import SamplingConfig, pick_frames
 from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.pretrain import MatchingConfig, draw_pair
 from tapip3d_lite.training.recipe import TrainConfig
@@ -202,7 +203,9 @@ def test_the_papers_recipe_takes_a_tiny_step(tmp_path, clips):
     before = {name: p.clone() for name, p in trainer.tracker.named_parameters()}
     assert trainer.run(progress=False)
     matching, tracking = read_log(tmp_path)
-    assert matching["right"] is not None and tracking["loss"] > 0 and trainer.examples.draw(1, 0, 6)[0].size == (32, 48)
+    assert (
+        matching["right"] is not None and tracking["loss"] > 0 and trainer.examples.batch(1, 1).frames.size == (32, 48)
+    )
     changed = {name.split(".")[0] for name, p in trainer.tracker.named_parameters() if not torch.equal(p, before[name])}
     assert {"encoder", "updater"} <= changed
 
@@ -211,13 +214,11 @@ def test_only_a_recipe_with_augmentation_changes_the_clips(tmp_path, clips):
     options = {"train_encoder": True, "matching_steps": 0}
     plain = Trainer(tmp_path / "plain", recipe(**options), clips)
     changed = Trainer(tmp_path / "changed", recipe(**options, augment=True), clips)
-    pairs = [[trainer.examples.draw(step, 0, 4)[0].depths for trainer in (plain, changed)] for step in range(8)]
-    different = [not np.array_equal(*pair) for pair in pairs]
+    pairs = [[trainer.examples.batch(step, step).frames.depths for trainer in (plain, changed)] for step in range(8)]
+    different = [not torch.equal(*pair) for pair in pairs]
     assert sum(different) >= 7
-    path, index = clips[0], np.arange(4)
-    whole = t3d.load_clip(path)
-    part = load_part(path, lambda available: index)
-    assert np.array_equal(part.video, whole.video[:4])
+    part = pick_frames(load_npz(clips[0]), np.arange(4), (32, 32))
+    assert np.array_equal(part.video, t3d.load_clip(clips[0]).video[:4])
     with pytest.raises(ValueError, match="train_encoder"):
         recipe(augment=True)
 

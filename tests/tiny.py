@@ -58,8 +58,9 @@ from tapip3d_lite.training.trainer import Trainer
 torch.set_num_threads(1)
 trainer = Trainer(sys.argv[1], recipe(), sorted(Path(sys.argv[2]).glob("*.npz")), resume=True)
 with interruptible() as stop:
-    done = trainer.run(stop, watch=lambda line: print(line["step"], flush=True), progress=False)
-sys.exit(0 if done else 130)
+    for line in trainer.steps(stop):
+        print(line["step"], flush=True)
+sys.exit(0 if trainer.schedule.finished else 130)
 """
 
 

@@ -14,7 +14,6 @@ from tapip3d_lite.figures.flat import INK, MOVING, STILL, check_drawable, draw_i
 from tapip3d_lite.geometry import invert, project
 from tapip3d_lite.training.augment import AugmentConfig, augmentations
 from tapip3d_lite.training.motion import MotionConfig, move, smooth_motion
-from tapip3d_lite.training.reframing import flip_time
 
 TITLES = {
     "erase": "eraser",
@@ -104,6 +103,14 @@ def motion_paths(
     axes[3].set_title("turn of the coordinates", fontsize=8, color=INK)
     axes[3].legend(fontsize=7, frameon=False)
     return figure
+
+
+def flip_time(clip: Clip) -> Clip:
+    """Play a clip with tracks backward; each query stays in the same image."""
+    queries = clip.queries * np.array([-1, 1, 1, 1], np.float32) + np.array([len(clip) - 1, 0, 0, 0], np.float32)
+    tracks = Tracks(clip.tracks.xyz[::-1], clip.tracks.visible[::-1], queries, dynamic=clip.tracks.dynamic)
+    frames = {name: getattr(clip, name)[::-1] for name in ("video", "depths", "intrinsics", "extrinsics")}
+    return replace(clip, **frames, tracks=tracks, queries=queries, extras={})
 
 
 def _strong(config: AugmentConfig) -> AugmentConfig:

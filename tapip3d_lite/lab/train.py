@@ -64,57 +64,43 @@ def train(
     device: str,
     workers: int | None = None,
     compiled: bool = False,
-    progress: bool = True,
 ) -> tuple[bool, str]:
-    """Run one training in a folder.
+    """Run one training in the folder `out`, with options as the command's; errors are a ValueError, as `Trainer`'s are.
 
-    Args:
-        out: the training's folder.
-        config: the recipe; with `resume` the folder's own recipe is used instead.
-        data: folder of the clips, shared by trainings; `out / "clips"` if None. Missing clips are simulated.
-        resume: continue from the folder's checkpoint.
-        device: `"cpu"` or `"cuda"`.
-        workers: processes that make examples ahead of time; None: none on a CPU, which needs its cores for the training
-            itself, else the number of cores less two.
-        compiled: compile the tracker's parts (GPU).
-        progress: show bars.
+    With `resume` the folder's own recipe is used. Missing clips are simulated in `data`, by default `out / "clips"`. By
+    default a CPU has no worker processes, since it needs its cores for the training itself.
 
     Returns:
         Whether the training is finished, and a message for the user.
-
-    Raises:
-        ValueError: as `Trainer` does; also without a GPU for `device="cuda"`, and for compiling without a GPU.
     """
-    recipe = Path(out) / "config.json"
-    if resume and recipe.exists():
-        config = TrainConfig.from_dict(json.loads(recipe.read_text()))
-    data = Path(out) / "clips" if data is None else Path(data)
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("train: torch sees no CUDA device; leave --device out to train on the CPU")
     if compiled and device != "cuda":
         raise ValueError("train: only a GPU gains from compiling; add --device cuda, or leave --compiled out")
+    recipe, data = out / "config.json", data or out / "clips"
+    if resume and recipe.exists():
+        config = TrainConfig.from_dict(json.loads(recipe.read_text()))
     if workers is None:
         cores = (os.cpu_count() or 2) // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
         workers = 0 if device == "cpu" else max(1, cores - 2)
     large = config.tracker_config().image_size > (128, 128)
     with _processes(device) as is_main:
-        progress = progress and is_main
+        held_out = []
         if is_main:
-            clips = training_clips(data / "train", config.clips, progress, large=large)
-            held_out = validation_clips(data / "validation", config.validation, progress) if config.validation else []
+            training_clips(data / "train", config.clips, large=large)
+            held_out = validation_clips(data / "validation", config.validation) if config.validation else []
             RunFolder(out, config, resume)  # checked, and made, once for all processes
         _wait()
-        if not is_main:
-            clips, held_out = training_clips(data / "train", config.clips, False, large=large), []
+        clips = training_clips(data / "train", config.clips, progress=False, large=large)  # all are there
         if device == "cuda" and config.precision == "bfloat16":
             torch.set_float32_matmul_precision("high")  # TF32, for what is left in float32
         options = {"device": device, "resume": True, "workers": workers, "compiled": compiled}
         trainer = make_trainer(out, config, clips, held_out, **options)
         with interruptible() as stop:
-            finished = trainer.run(stop, progress=progress)
+            finished = trainer.run(stop)
         _wait()  # for the main process, which writes the weights
     if finished:
-        return True, f"finished: {Path(out) / 'weights.safetensors'}"
+        return True, f"finished: {out / 'weights.safetensors'}"
     done = f"step {trainer.step} of {config.total}" if config.minutes is None else f"step {trainer.step}"
     return False, f"stopped and saved at {done}; continue with --resume"
 

@@ -38,18 +38,10 @@ def add_gradients(
 ) -> Tensor:
     """Add the gradients of the whole loss to the parameters' gradients, one update at a time.
 
-    Args:
-        tracker: in training mode.
-        frames: T frames.
-        queries: (B, N, 4) rows (t, x, y, z), world.
-        truth: of the same tracks.
-        config: weights of the loss.
-        features: (B, T, C, h, w) of an encoder that is not trained along; None: encode the frames.
-        watch: called with every update before its tensors are freed.
-        options: of `Tracker.steps`, e.g. `active`, `iterations`, `space`.
-
-    Returns:
-        (2,) the position and visibility parts of the loss, without gradient.
+    Queries (B, N, 4) are rows (t, x, y, z), world, and `truth` belongs to the same tracks. `features` (B, T, C, h, w) are
+    those of an encoder that is not trained along; without them the frames are encoded. `watch` is called with every
+    update before its tensors are freed; `options` are those of `Tracker.steps`, e.g. `active`, `iterations`, `space`.
+    Returns the position and visibility parts (2,) of the loss, without gradient.
     """
     features = tracker.encoder(frames.rgb) if features is None else features
     whole, window = Leaves(), Leaves()

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
 from tapip3d_lite.simulate.seeds import TRAINING, VALIDATION
 from tapip3d_lite.training.loss import Truth
+from tapip3d_lite.validate import check_range
 
 
 def training_config(seed: int) -> SimulationConfig:
@@ -90,24 +91,14 @@ class SamplingConfig:
     backward: float = 0.5
 
     def __post_init__(self) -> None:
-        if self.tracks < 1 or not all(0 <= x <= 1 for x in (self.seen, self.anywhere, self.backward)):
-            raise ValueError(f"SamplingConfig: tracks must be positive and shares in [0, 1], got {self}")
+        check_range(self, 1, math.inf, "tracks")
+        check_range(self, 0, 1, "seen", "anywhere", "backward")
 
 
 def draw_frames(rng: np.random.Generator, available: int, wanted: int, backward: float) -> np.ndarray:
-    """Draw consecutive frames, sometimes from last to first.
+    """Draw T = `wanted` consecutive frames, with probability `backward` from last to first: indices (T,).
 
-    Args:
-        rng: random generator.
-        available: number of frames of the clip.
-        wanted: T, number of frames of the example.
-        backward: probability of the order from last to first.
-
-    Returns:
-        Frame indices (T,).
-
-    Raises:
-        ValueError: fewer frames are available than wanted.
+    A clip with fewer available frames is a ValueError.
     """
     if wanted > available:
         raise ValueError(f"frames: an example needs {wanted} frames, the clip has {available}; lower frames")
@@ -116,7 +107,7 @@ def draw_frames(rng: np.random.Generator, available: int, wanted: int, backward:
     return index[::-1].copy() if rng.random() < backward else index
 
 
-def _query_rows(xyz: np.ndarray, times: np.ndarray) -> np.ndarray:
+def query_rows(xyz: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Query rows (N, 4) of tracks xyz (T, N, 3) at frames times (N,)."""
     return np.concatenate([times[:, None], xyz[times, np.arange(len(times))]], -1).astype(np.float32)
 
@@ -124,16 +115,7 @@ def _query_rows(xyz: np.ndarray, times: np.ndarray) -> np.ndarray:
 def sample_tracks(clip: Clip, rng: np.random.Generator, config: SamplingConfig) -> Clip:
     """Draw N of a clip's tracks and the frames of their queries.
 
-    Args:
-        clip: with tracks.
-        rng: random generator.
-        config: how many, and which.
-
-    Returns:
-        The clip with exactly N tracks; where fewer are visible in enough frames, some appear more than once.
-
-    Raises:
-        ValueError: no track is visible in enough frames.
+    Where fewer than N are visible in enough frames, some appear more than once; where none is, it is a ValueError.
     """
     visible = clip.tracks.visible
     good = np.flatnonzero(visible.mean(0) >= max(config.seen, 1 / len(visible)))
@@ -148,39 +130,26 @@ def sample_tracks(clip: Clip, rng: np.random.Generator, config: SamplingConfig) 
     for n in np.flatnonzero(rng.random(config.tracks) < config.anywhere):
         times[n] = rng.choice(np.flatnonzero(visible[:, n]))
     picked = clip.tracks.select(chosen)
-    queries = _query_rows(picked.xyz, times)
+    queries = query_rows(picked.xyz, times)
     return replace(clip, queries=queries, tracks=replace(picked, queries=queries))
 
 
-def load_part(
-    path: str | Path, choose: Callable[[int], np.ndarray], colours: bool = True, size: tuple[int, int] | None = None
-) -> Clip:
-    """Load some frames of a stored clip, with the tracks visible in them; each query is in the first visible frame.
+def pick_frames(arrays: Mapping[str, np.ndarray], index: np.ndarray, size: tuple[int, int]) -> Clip:
+    """A clip of some frames (T,) of a stored clip's arrays, in any order, with the tracks that are visible in them.
 
-    Args:
-        path: an npz file with tracks.
-        choose: takes the number of frames in the file, returns the indices (T,) of those wanted, in any order.
-        colours: if False, the video is not read and stays black.
-        size: (H, W) of the result; None keeps the stored size.
-
-    Returns:
-        A clip of T frames.
+    Each query is in the first visible frame. Images are resized to `size` (H, W); without "video" they are black.
     """
-    arrays = load_npz(path, skip=() if colours else ("video",))
-    index = choose(len(arrays["depths"]))
     frames = {name: arrays[name][index] for name in ("depths", "intrinsics", "extrinsics")}
-    video = arrays["video"][index] if colours else np.zeros((*frames["depths"].shape, 3), np.uint8)
-    xyz, visible = arrays["tracks"][index], arrays["visible"][index]
-    kept = visible.any(0)
-    xyz, visible = xyz[:, kept], visible[:, kept]
-    queries = _query_rows(xyz, visible.argmax(0))
+    video = arrays["video"][index] if "video" in arrays else np.zeros((*frames["depths"].shape, 3), np.uint8)
+    kept = arrays["visible"][index].any(0)
+    xyz, visible = (arrays[name][index][:, kept] for name in ("tracks", "visible"))
     dynamic = arrays["dynamic"][kept] if "dynamic" in arrays else None
-    tracks = Tracks(xyz, visible, queries, dynamic=dynamic)
-    clip = Clip(video, **frames, queries=queries, tracks=tracks, name=str(arrays["name"]), fps=float(arrays["fps"]))
-    if size in (None, clip.size):
+    tracks = Tracks(xyz, visible, query_rows(xyz, visible.argmax(0)), dynamic=dynamic)
+    clip = Clip(video, **frames, tracks=tracks, name=str(arrays["name"]), fps=float(arrays["fps"]))
+    if size == clip.size:
         return clip
     resized = resize_clip(clip, size)
-    return replace(clip, video=resized.video, depths=resized.depths, intrinsics=resized.intrinsics, extras={})
+    return replace(clip, video=resized.video, depths=resized.depths, intrinsics=resized.intrinsics)
 
 
 @dataclass(frozen=True)
@@ -208,53 +177,34 @@ class Batch:
     iterations: int | None = None
 
     def to(self, device: torch.device | str) -> Batch:
-        """The batch on a device, with colours and features as float32."""
-        batch = self.map(lambda x: x.to(device))
-        features = None if batch.features is None else batch.features.float()
-        rgb = batch.frames.rgb
-        rgb = rgb.float() / 255 if rgb.dtype == torch.uint8 else rgb
-        return replace(batch, frames=replace(batch.frames, rgb=rgb), features=features)
+        """The batch on a device, with colours, which alone are bytes, as float32 in [0, 1]."""
+        return self.map(lambda x: x.to(device).float() / 255 if x.dtype == torch.uint8 else x.to(device))
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Batch:
         """The batch with every tensor replaced by `change` of it, always in the same order."""
-        frames, truth = (
-            type(part)(*(change(getattr(part, f.name)) for f in fields(part))) for part in (self.frames, self.truth)
-        )
+        frames, truth = (type(part)(*map(change, vars(part).values())) for part in (self.frames, self.truth))
+        queries, dynamic, roi = change(self.queries), change(self.dynamic), tuple(map(change, self.roi))
         features = None if self.features is None else change(self.features)
-        roi = tuple(change(x) for x in self.roi)
-        queries, dynamic = change(self.queries), change(self.dynamic)
         return Batch(frames, queries, truth, dynamic, roi, features, self.names, self.iterations)
 
 
 def make_batch(clips: list[Clip], features: list[Tensor] | None = None, iterations: int | None = None) -> Batch:
-    """Stack clips that have equally many frames and tracks.
+    """Stack clips that have equally many frames and tracks, at the model's image size.
 
-    Args:
-        clips: with tracks, at the model's image size.
-        features: (T, C, h, w) of each clip, where they are already known.
-        iterations: M of the step; None: the tracker's own number.
+    `features` (T, C, h, w) are those of each clip, where they are already known; `iterations` is M of the step.
     """
-    video, *others = (
-        torch.from_numpy(np.stack([getattr(clip, name) for clip in clips]))
-        for name in ("video", "depths", "intrinsics", "extrinsics")
-    )
-    frames = Frames(video.movedim(-1, 2), *others)
-    tracks = [clip.tracks for clip in clips]
-    queries = torch.stack([torch.from_numpy(x.queries) for x in tracks])
-    xyz, visible = (torch.stack([torch.from_numpy(getattr(x, name)) for x in tracks]) for name in ("xyz", "visible"))
-    dynamic = [np.zeros(x.queries.shape[0], bool) if x.dynamic is None else x.dynamic for x in tracks]
-    near, far = zip(*(quantile_roi(x) for x in frames.depths), strict=True)
-    roi = tuple(torch.tensor(x).view(-1, 1, 1, 1) for x in (near, far))
-    return Batch(
-        frames,
-        queries,
-        Truth(xyz, visible, queries[..., 0].long()),
-        torch.from_numpy(np.stack(dynamic)),
-        roi,
-        None if features is None else torch.stack(features),
-        tuple(clip.name for clip in clips),
-        iterations,
-    )
+
+    def stack(arrays: Iterable[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.stack(list(arrays)))
+
+    tracks, names = [clip.tracks for clip in clips], tuple(clip.name for clip in clips)
+    frames = [stack(getattr(clip, x) for clip in clips) for x in ("video", "depths", "intrinsics", "extrinsics")]
+    frames = Frames(frames[0].movedim(-1, 2), *frames[1:])
+    queries, xyz, visible = (stack(getattr(x, name) for x in tracks) for name in ("queries", "xyz", "visible"))
+    dynamic = stack(np.zeros(len(x.queries), bool) if x.dynamic is None else x.dynamic for x in tracks)
+    truth, features = Truth(xyz, visible, queries[..., 0].long()), None if features is None else torch.stack(features)
+    roi = tuple(torch.tensor(x).view(-1, 1, 1, 1) for x in zip(*map(quantile_roi, frames.depths), strict=True))
+    return Batch(frames, queries, truth, dynamic, roi, features, names, iterations)
 
 
 class FeatureCache:
@@ -267,7 +217,7 @@ class FeatureCache:
         """Raise a ValueError with the sizes if the features of these clips do not fit on the disk."""
         maps = self.encoder.head.out_channels * math.prod(side // self.encoder.stride for side in self.size)
         frames = len(load_npz(clips[0], skip=("video", "tracks", "visible"))["depths"])
-        missing = sum(not (self.folder / f"{clip.stem}.npy").exists() for clip in clips)
+        missing = sum(not self._path(clip).exists() for clip in clips)
         needed, free = missing * frames * maps * 2, shutil.disk_usage(self.folder.parent).free
         if needed > free:
             raise ValueError(
@@ -275,19 +225,17 @@ class FeatureCache:
                 f"{free / 1e9:.1f} GB are free; use fewer clips, another folder, or train the encoder along"
             )
 
+    def _path(self, clip: Path) -> Path:
+        return self.folder / f"{clip.stem}.npy"
+
     @torch.no_grad()
-    def path(self, clip: Path) -> Path:
-        """The file with one clip's features (T, C, h, w) float16; encodes the clip if there is none yet."""
-        path = self.folder / f"{clip.stem}.npy"
+    def frames(self, clip: Path, index: np.ndarray) -> Tensor:
+        """Features (len(index), C, h, w) float32 of some frames of a clip, which is encoded if there is no file yet."""
+        path = self._path(clip)
         if not path.exists():
             device = next(self.encoder.parameters()).device
             frames = frames_from_clip(resize_clip(load_clip(clip, points=False), self.size), device=device)
             features = self.encoder(frames.rgb)[0]
             with atomic_path(path) as temporary:
                 np.save(temporary, features.half().cpu().numpy())
-        return path
-
-    def frames(self, clip: Path, index: np.ndarray) -> Tensor:
-        """Features (len(index), C, h, w) float32 of some frames of a clip."""
-        stored = np.load(self.path(clip), mmap_mode="r")
-        return torch.from_numpy(stored[index]).float()
+        return torch.from_numpy(np.load(path, mmap_mode="r")[index]).float()

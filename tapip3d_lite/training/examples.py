@@ -14,9 +14,10 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.files import load_npz
 from tapip3d_lite.simulate.dataset import leave_interrupts
 from tapip3d_lite.training.augment import augment
-from tapip3d_lite.training.data import Batch, FeatureCache, draw_frames, load_part, make_batch, sample_tracks
+from tapip3d_lite.training.data import Batch, FeatureCache, draw_frames, make_batch, pick_frames, sample_tracks
 from tapip3d_lite.training.motion import random_coordinates
 from tapip3d_lite.training.pretrain import FramePair, draw_pair
 from tapip3d_lite.training.recipe import TrainConfig
@@ -31,13 +32,9 @@ class Examples(Dataset):
     def __init__(
         self, config: TrainConfig, clips: Sequence[Path], rank: int = 0, cache: FeatureCache | None = None
     ) -> None:
-        """Draw from clips.
+        """Draw from clips (npz files with tracks, of any image size) the share of the process with this rank.
 
-        Args:
-            config: the recipe.
-            clips: npz files with tracks, of any image size.
-            rank: of this process among those that share the training.
-            cache: features of a frozen encoder; batches then have no images.
+        With a cache of a frozen encoder's features, batches have no images.
         """
         self.config, self.clips, self.rank, self.cache = config, list(clips), rank, cache
         self.size = config.tracker_config().image_size
@@ -58,50 +55,40 @@ class Examples(Dataset):
     def pairs(self, step: int) -> list[FramePair]:
         """This process's share of a step's pairs of frames."""
         config = self.config
-        augmentation, pairs = config.augmentation if config.augment else None, []
-        for slot in _share(self.rank, config.matching.pairs):
-            rng = np.random.default_rng([config.seed, step, slot])
-            path = self.clips[rng.integers(len(self.clips))]
-            pairs.append(draw_pair(path, rng, config.matching, self.size, augmentation))
-        return pairs
-
-    def draw(self, step: int, slot: int, frames: int) -> tuple[Clip, torch.Tensor | None]:
-        """The clip in one slot of a step's batch, and its features if these are stored."""
-        config, rng = self.config, np.random.default_rng([self.config.seed, step, slot])
-        path = self.clips[rng.integers(len(self.clips))]
-        chosen = np.zeros(0, int)
-
-        def choose(available: int) -> np.ndarray:
-            nonlocal chosen
-            chosen = draw_frames(rng, available, frames, config.sampling.backward)
-            return chosen
-
-        clip = load_part(path, choose, self.cache is None, self.size)
-        if config.augment:
-            clip = augment(clip, rng, config.augmentation)
-        clip = random_coordinates(sample_tracks(clip, rng, config.sampling), rng, config.motion)
-        return clip, None if self.cache is None else self.cache.frames(path, chosen)
+        options = config.matching, self.size, config.augmentation if config.augment else None
+        return [draw_pair(path, rng, *options) for path, rng in self._draws(step, config.matching.pairs)]
 
     def batch(self, step: int, position: float) -> Batch:
         """This process's share of a step's clips."""
         frames, iterations = self.lengths(step, position)
-        slots = _share(self.rank, self.config.batch)
-        clips, features = zip(*(self.draw(step, slot, frames) for slot in slots), strict=True)
-        return make_batch(list(clips), None if self.cache is None else list(features), iterations)
+        drawn = [self._example(path, rng, frames) for path, rng in self._draws(step, self.config.batch)]
+        clips, features = map(list, zip(*drawn, strict=True))
+        return make_batch(clips, None if self.cache is None else features, iterations)
+
+    def _draws(self, step: int, count: int) -> Iterator[tuple[Path, np.random.Generator]]:
+        """A clip's file and a random generator for each of this process's `count` places in a step."""
+        for slot in range(self.rank * count, (self.rank + 1) * count):
+            rng = np.random.default_rng([self.config.seed, step, slot])
+            yield self.clips[rng.integers(len(self.clips))], rng
+
+    def _example(self, path: Path, rng: np.random.Generator, frames: int) -> tuple[Clip, torch.Tensor | None]:
+        """Some frames of a clip, augmented, with drawn tracks; and its features if these are stored."""
+        config = self.config
+        arrays = load_npz(path, skip=() if self.cache is None else ("video",))
+        index = draw_frames(rng, len(arrays["depths"]), frames, config.sampling.backward)
+        clip = pick_frames(arrays, index, self.size)
+        if config.augment:
+            clip = augment(clip, rng, config.augmentation)
+        clip = random_coordinates(sample_tracks(clip, rng, config.sampling), rng, config.motion)
+        return clip, None if self.cache is None else self.cache.frames(path, index)
 
     def stream(self, places: Iterable[tuple[int, float]], workers: int = 0) -> Iterator[list[FramePair] | Batch]:
-        """The examples at some places, in order.
+        """The examples at some places (step, position), in order.
 
-        Args:
-            places: (step, position) of each; read a few steps ahead if there are workers. All of one stage, because
-                the next stage's examples depend on what this one teaches the encoder.
-            workers: processes that make examples ahead of time; 0: each is made when it is needed.
+        Worker processes read places and make examples a few steps ahead. All are of one stage, because the next stage's
+        examples depend on what this one teaches the encoder.
         """
         if not workers:
             return (self[place] for place in places)
         own = {"generator": torch.Generator(), "worker_init_fn": leave_interrupts}  # not the caller's generator
         return iter(DataLoader(self, None, sampler=places, num_workers=workers, **own))
-
-
-def _share(rank: int, count: int) -> range:
-    return range(rank * count, (rank + 1) * count)

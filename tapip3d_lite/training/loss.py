@@ -1,4 +1,4 @@
-"""The training loss of one update, in the paper's form and in the released code's.
+"""The training loss and the accuracy of one update; the loss in the paper's form and in the released code's.
 
 Paper, equation (4): L = sum_m gamma^(M - m) [ sum (1/d) |x - x*| + alpha BCE(v, v*) ], with d the true depth,
 gamma = 0.8, alpha = 3. The released code takes means instead of sums, and multiplies the position term by the focal
@@ -8,14 +8,16 @@ always takes means, over the frames from the query on. The options `soften` and 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from tapip3d_lite.geometry import transform
+from tapip3d_lite.geometry import RASTER, THRESHOLDS, transform
 from tapip3d_lite.model.windows import Step
+from tapip3d_lite.validate import check_range
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,7 @@ class LossConfig:
     def __post_init__(self) -> None:
         if self.form not in ("paper", "pixels"):
             raise ValueError(f'LossConfig.form: expected "paper" or "pixels", got {self.form!r}')
-        if min(self.visibility, self.scale, self.soften, self.within) < 0:
-            raise ValueError("LossConfig: visibility, scale, soften and within must not be negative")
+        check_range(self, 0, math.inf, "visibility", "scale", "soften", "within")
         if not 0 < self.discount <= 1:
             raise ValueError(f"LossConfig.discount: expected a value in (0, 1], got {self.discount}")
 
@@ -81,14 +82,8 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
         Two scalars whose sum is minimised. Frames before the query, padded frames (repetitions of the last one) and
         inactive tracks, which only fill up the batch, do not count.
     """
-    frames = step.scene.frames
-    index = torch.arange(step.start, step.start + len(frames), device=step.coords.device)
-    real = index.clamp(max=truth.xyz.shape[1] - 1)
-    target, visible = truth.xyz[:, real][:, :, step.columns], truth.visible[:, real][:, :, step.columns]
-    counted = (index[None, :, None] >= truth.times[:, None, step.columns]) & step.active[:, None]
-    counted = counted & (index < truth.xyz.shape[1])[None, :, None]
-    depth = transform(target, frames.extrinsics)[..., 2].clamp(min=0.1)
-    focal = (frames.intrinsics[..., 0, 0] * frames.intrinsics[..., 1, 1]).sqrt()[..., None]
+    target, visible, counted, depth, focal = _compared(step, truth)
+    depth = depth.clamp(min=0.1)
     pixels = (step.xyz - target).square().sum(-1).add(1e-12).sqrt() / depth * focal
     if config.within:
         visible = visible & (pixels < config.within)
@@ -102,3 +97,40 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
         ((x * counted).flatten(1).sum(1) / counted.flatten(1).sum(1).clamp(min=1)).mean() for x in (error, entropy)
     )
     return weight * position, weight * config.visibility * visibility
+
+
+@torch.no_grad()
+def step_accuracy(step: Step, truth: Truth, dynamic: Tensor) -> Tensor:
+    """APD3D of one update, over visible points from their query on, without waiting for the GPU.
+
+    A point counts for the share of the thresholds k that its error |x - x*| sqrt(fx fy) / d stays below, in pixels of
+    the benchmark's raster, with d the true depth.
+
+    Returns:
+        (2, 2), sums over points of (this share, 1), for (all, dynamic) points, of which `dynamic` (B, N) is the mask.
+    """
+    target, visible, counted, depth, focal = _compared(step, truth)
+    counted = counted & visible
+    raster = RASTER / min(step.scene.frames.size)
+    pixels = (step.xyz - target).norm(dim=-1) / depth.clamp(min=1e-6) * (focal * raster)
+    inside = torch.stack([(pixels < k).float() for k in THRESHOLDS]).mean(0)
+    masks = torch.stack([counted, counted & dynamic[:, None, step.columns]])  # (2, B, S, n)
+    return torch.stack([inside * masks, masks.float()]).flatten(2).sum(-1)
+
+
+def accuracy(totals: Tensor) -> dict[str, float | None]:
+    """`apd` and `apd_dynamic` from sums of `step_accuracy`, None where no point was visible; this waits for the GPU."""
+    names, (inside, counted) = ("apd", "apd_dynamic"), totals.tolist()
+    return {name: part / count if count else None for name, part, count in zip(names, inside, counted, strict=True)}
+
+
+def _compared(step: Step, truth: Truth) -> tuple[Tensor, ...]:
+    """True positions (B, S, n, 3) and visibility (B, S, n) of a window, which of them count, depths, focal lengths (B, S, 1)."""
+    frames, last = step.scene.frames, truth.xyz.shape[1] - 1
+    index = torch.arange(step.start, step.start + len(frames), device=step.coords.device)
+    real = index.clamp(max=last)
+    target, visible = (x[:, real][:, :, step.columns] for x in (truth.xyz, truth.visible))
+    counted = (index[None, :, None] >= truth.times[:, None, step.columns]) & step.active[:, None]
+    counted = counted & (index <= last)[None, :, None]
+    focal = (frames.intrinsics[..., 0, 0] * frames.intrinsics[..., 1, 1]).sqrt()[..., None]
+    return target, visible, counted, transform(target, frames.extrinsics)[..., 2], focal

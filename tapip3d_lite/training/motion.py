@@ -7,6 +7,7 @@ all such motions, none included, works in either space. Ours also leaves a share
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -14,6 +15,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert, transform
+from tapip3d_lite.validate import check_range
 
 
 @dataclass(frozen=True)
@@ -42,18 +44,19 @@ class MotionConfig:
     smoothing: float = 0.8
 
     def __post_init__(self) -> None:
-        shares = self.world, self.turned, self.still, self.smoothing
-        if not all(0 <= x <= 1 for x in shares) or self.world + self.turned > 1:
-            raise ValueError(f"MotionConfig: shares must be in [0, 1], world + turned at most 1; got {shares}")
-        if min(self.velocity, self.velocity_noise, self.rotation, self.rotation_noise) < 0:
-            raise ValueError("MotionConfig: velocity and rotation must not be negative")
+        check_range(self, 0, 1, "world", "turned", "still", "smoothing")
+        check_range(self, 0, math.inf, "velocity", "velocity_noise", "rotation", "rotation_noise")
+        if self.world + self.turned > 1:
+            raise ValueError(f"MotionConfig: world + turned must be at most 1, got {self.world} + {self.turned}")
 
 
 def smooth_motion(rng: np.random.Generator, frames: int, config: MotionConfig) -> np.ndarray:
     """Draw a rigid motion (T, 4, 4) that starts at the identity and whose velocity changes smoothly."""
     limits = np.array([config.velocity, config.rotation])[:, None]
     noise = np.array([config.velocity_noise, config.rotation_noise])[:, None]
-    speed = _directions(rng) * rng.uniform(0, 1, (2, 1)) * limits  # (translation, rotation) per frame
+    directions = rng.normal(size=(2, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    speed = directions * rng.uniform(0, 1, (2, 1)) * limits  # (translation, rotation) per frame
     change, motion = np.zeros((2, 3)), [np.eye(4)]
     for _ in range(frames - 1):
         change = config.smoothing * change + (1 - config.smoothing) * noise * rng.normal(size=(2, 3))
@@ -65,22 +68,16 @@ def smooth_motion(rng: np.random.Generator, frames: int, config: MotionConfig) -
 
 
 def move(clip: Clip, motion: np.ndarray) -> Clip:
-    """Express a clip in other coordinates: a point at x in frame t is then at motion[t] x.
+    """Express a clip with tracks in other coordinates, by a rigid motion (T, 4, 4) float64.
 
-    Args:
-        clip: T frames.
-        motion: (T, 4, 4), rigid.
-
-    Returns:
-        The clip with other extrinsics, queries and tracks, which project to the same pixels as before.
+    A point at x in frame t is then at motion[t] x, and projects to the same pixel as before.
     """
-    motion = np.asarray(motion, np.float64)
     extrinsics = clip.extrinsics.astype(np.float64) @ invert(motion)
-    tracks, queries = clip.tracks, _move_rows(clip.queries, motion)
-    if tracks is not None:
-        xyz = transform(tracks.xyz.astype(np.float64), motion)
-        tracks = replace(tracks, xyz=xyz.astype(np.float32), queries=queries)
-    return replace(clip, extrinsics=extrinsics.astype(np.float32), tracks=tracks, queries=queries)
+    at = motion[clip.queries[:, 0].astype(int)]
+    places = transform(clip.queries[:, None, 1:].astype(np.float64), at)[:, 0]
+    queries = np.concatenate([clip.queries[:, :1], places], -1)
+    tracks = replace(clip.tracks, xyz=transform(clip.tracks.xyz.astype(np.float64), motion), queries=queries)
+    return replace(clip, extrinsics=extrinsics, tracks=tracks, queries=queries)
 
 
 def random_coordinates(clip: Clip, rng: np.random.Generator, config: MotionConfig) -> Clip:
@@ -88,27 +85,13 @@ def random_coordinates(clip: Clip, rng: np.random.Generator, config: MotionConfi
     kind = rng.random()
     if kind < config.world:
         return clip
-    frames = len(clip)
     if kind < config.world + config.turned:
         turn = np.eye(4)
         turn[:3, :3] = _random_rotation(rng)
-        return move(clip, np.repeat(turn[None], frames, 0))
+        return move(clip, np.repeat(turn[None], len(clip), 0))
     still = rng.random() < config.still
-    motion = np.eye(4) if still else smooth_motion(rng, frames, config)
+    motion = np.eye(4) if still else smooth_motion(rng, len(clip), config)
     return move(clip, motion @ clip.extrinsics.astype(np.float64))
-
-
-def _move_rows(rows: np.ndarray | None, motion: np.ndarray) -> np.ndarray | None:
-    if rows is None:
-        return None
-    at = motion[rows[:, 0].astype(int)]
-    xyz = transform(rows[:, None, 1:].astype(np.float64), at)[:, 0]
-    return np.concatenate([rows[:, :1], xyz], -1).astype(np.float32)
-
-
-def _directions(rng: np.random.Generator) -> np.ndarray:
-    rows = rng.normal(size=(2, 3))
-    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
 
 
 def _random_rotation(rng: np.random.Generator) -> np.ndarray:

@@ -14,37 +14,30 @@ class Group:
     Attributes:
         rank: of this process, from 0.
         size: number of processes.
+        is_main: whether this process writes files and shows the bar.
     """
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
         active = distributed.is_available() and distributed.is_initialized()
         self.rank, self.size = (distributed.get_rank(), distributed.get_world_size()) if active else (0, 1)
-        self._device = device
-
-    @property
-    def is_main(self) -> bool:
-        """Whether this process writes files and shows the bar."""
-        return self.rank == 0
+        self.is_main, self._device = self.rank == 0, device
 
     @torch.no_grad()
     def copy_from_main(self, parameters: Iterable[nn.Parameter]) -> None:
         """Overwrite parameters by those of the main process."""
-        if self.size > 1:
-            for parameter in parameters:
-                distributed.broadcast(parameter, 0)
+        for parameter in parameters if self.size > 1 else ():
+            distributed.broadcast(parameter, 0)
 
     def average(self, parameters: Sequence[nn.Parameter]) -> None:
         """Replace gradients by their mean over processes, in place."""
         if self.size == 1:
             return
-        for parameter in parameters:
-            if parameter.grad is None:
-                parameter.grad = torch.zeros_like(parameter)
-        gradients = [parameter.grad for parameter in parameters]
+        gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
         flat = torch.cat([gradient.flatten() for gradient in gradients]) / self.size
         distributed.all_reduce(flat)
-        for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
-            gradient.copy_(part.view_as(gradient))
+        parts = flat.split([gradient.numel() for gradient in gradients])
+        for parameter, gradient, part in zip(parameters, gradients, parts, strict=True):
+            parameter.grad = gradient.copy_(part.view_as(gradient))
 
     def sum(self, value: float) -> float:
         """The sum of a number over processes."""

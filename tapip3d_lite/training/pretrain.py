@@ -18,10 +18,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.files import load_npz
 from tapip3d_lite.geometry import project
 from tapip3d_lite.model.blocks import constant
 from tapip3d_lite.training.augment import AugmentConfig, augment
-from tapip3d_lite.training.data import load_part
+from tapip3d_lite.training.data import pick_frames
 
 _ENOUGH = 16  # points that two frames should share
 _NEAR = 2.5  # radius in cells, around the true place, of the cells whose mean gives a point's place
@@ -73,21 +74,16 @@ class FramePair:
 
 
 def draw_pair(
-    path: str | Path,
+    path: Path,
     rng: np.random.Generator,
     config: MatchingConfig,
-    size: tuple[int, int] | None = None,
+    size: tuple[int, int],
     augmentation: AugmentConfig | None = None,
 ) -> FramePair:
-    """Draw two frames of a clip and points that are visible in both, and augment them.
+    """Draw two frames, resized to (H, W), of a stored clip with tracks, and points that are visible in both.
 
-    Args:
-        path: an npz file with tracks.
-        rng: random generator.
-        config: greatest distance of the frames, and number of points.
-        size: (H, W) of the frames; None keeps the stored size.
-        augmentation: of the tracker's training, used where enough points stay visible; None: the frames are only
-            mirrored, and their brightness and contrast changed by `jitter`.
+    The tracker's augmentation is used where enough points stay visible; without one the frames are only mirrored, and
+    their brightness and contrast changed by `jitter`.
     """
     clip, points = _two_frames(path, rng, config.gap, size)
     if augmentation is not None:
@@ -113,18 +109,14 @@ def _vary(rgb: np.ndarray, uv: np.ndarray, rng: np.random.Generator, jitter: flo
     return np.clip(rgb * contrast + brightness, 0, 1).astype(np.float32), uv
 
 
-def _two_frames(
-    path: str | Path, rng: np.random.Generator, gap: int, size: tuple[int, int] | None
-) -> tuple[Clip, np.ndarray]:
+def _two_frames(path: Path, rng: np.random.Generator, gap: int, size: tuple[int, int]) -> tuple[Clip, np.ndarray]:
     """Frames at most `gap` apart, less where they share too few points, and the points visible in both."""
-
-    def choose(available: int) -> np.ndarray:
+    arrays = load_npz(path)
+    available = len(arrays["depths"])
+    while True:
         distance = min(int(rng.integers(1, gap + 1)), available - 1)
         first = int(rng.integers(available - distance))
-        return rng.permutation([first, first + distance])
-
-    while True:
-        clip = load_part(path, choose, size=size)
+        clip = pick_frames(arrays, rng.permutation([first, first + distance]), size)
         both = np.flatnonzero(clip.tracks.visible.all(0))
         if len(both) >= _ENOUGH or gap == 1:
             return clip, both
@@ -134,14 +126,8 @@ def _two_frames(
 def matching_loss(encoder: nn.Module, pairs: Sequence[FramePair], config: MatchingConfig) -> tuple[Tensor, Tensor]:
     """InfoNCE over all cells of the other frame, plus the distance of the place that the similarities near it give.
 
-    Args:
-        encoder: maps (P, 2, 3, H, W) to (P, 2, C, h, w).
-        pairs: P pairs of frames.
-        config: levels and target.
-
-    Returns:
-        The loss, and the share of points whose most similar cell of the finest level is within 1.5 cells of the true
-        place; both are means over pairs.
+    Means over P pairs, whose frames the encoder maps from (P, 2, 3, H, W) to (P, 2, C, h, w), of the loss and of the
+    share of points whose most similar cell of the finest level is within 1.5 cells of the true place.
     """
     maps = encoder(torch.stack([pair.rgb for pair in pairs]))
     with torch.autocast(maps.device.type, enabled=False):

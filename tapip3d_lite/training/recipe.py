@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+import json
+import math
+from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import Any
 
 from tapip3d_lite.model.config import TrackerConfig
@@ -11,6 +13,7 @@ from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.pretrain import MatchingConfig
+from tapip3d_lite.validate import check_range
 
 
 @dataclass(frozen=True)
@@ -83,17 +86,15 @@ class TrainConfig:
             object.__setattr__(self, name, (value, value) if isinstance(value, int) else tuple(value))
             if len(getattr(self, name)) != 2 or not 1 <= getattr(self, name)[0] <= getattr(self, name)[1]:
                 raise ValueError(f"TrainConfig.{name}: expected (fewest, most), both at least 1, got {value}")
-        for name in ("clips", "steps", "batch", "evaluate_every", "save_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"TrainConfig.{name}: expected at least 1, got {getattr(self, name)}")
-        if self.matching_steps < 0 or self.validation < 0:
-            raise ValueError("TrainConfig: matching_steps and validation must not be negative")
+        check_range(self, 1, math.inf, "clips", "steps", "batch", "evaluate_every", "save_every")
+        check_range(self, 0, math.inf, "matching_steps", "validation")
+        check_range(self, 0, 1, "short")
         if self.minutes is not None and self.minutes <= 0:
             raise ValueError(f"TrainConfig.minutes: expected a positive time or None, got {self.minutes}")
         if self.precision not in ("float32", "bfloat16"):
             raise ValueError(f'TrainConfig.precision: expected "float32" or "bfloat16", got {self.precision!r}')
-        if self.lr <= 0 or not 0 < self.warmup < 1 or not 0 <= self.short <= 1:
-            raise ValueError("TrainConfig: lr must be positive, warmup in (0, 1), short in [0, 1]")
+        if self.lr <= 0 or not 0 < self.warmup < 1:
+            raise ValueError(f"TrainConfig: lr must be positive, warmup in (0, 1), got {self.lr} and {self.warmup}")
         if self.augment and not self.train_encoder:
             raise ValueError(
                 "TrainConfig.augment: features of a frozen encoder are stored in files and cannot follow changed images; "
@@ -108,11 +109,8 @@ class TrainConfig:
         """The recipe of a preset: `"lite"` (the defaults), or `"paper"`.
 
         Paper: section 4 and appendix; 8 processes with a GPU each. Optimiser, schedule, batches, loss and augmentation
-        are the paper's; ours are the simulated clips, and the pretraining in place of CoTracker3's encoder.
-
-        Args:
-            preset: `"lite"` or `"paper"`.
-            changes: fields to set differently.
+        are the paper's; ours are the simulated clips, and the pretraining in place of CoTracker3's encoder. `changes`
+        are fields to set differently.
         """
         paper = {
             "clips": 10_000,
@@ -142,19 +140,14 @@ class TrainConfig:
         return self.matching_steps + self.steps
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return asdict(self)
+        """Plain values, as they come back from JSON."""
+        return json.loads(json.dumps(asdict(self)))
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainConfig:
-        """The inverse of `to_dict`; fields that an older file lacks get their defaults.
-
-        Raises:
-            ValueError: unknown names.
-        """
-        unknown = set(values) - {f.name for f in fields(cls)}
+        """The inverse of `to_dict`; fields that an older file lacks get their defaults, unknown ones are a ValueError."""
+        parts = vars(cls())
+        unknown = set(values) - set(parts)
         if unknown:
             raise ValueError(f"TrainConfig: unknown {', '.join(sorted(unknown))}; was it written by another version?")
-        parts: dict[str, type] = {"loss": LossConfig, "motion": MotionConfig, "sampling": SamplingConfig}
-        parts |= {"matching": MatchingConfig, "augmentation": AugmentConfig}
-        return cls(**{k: parts[k](**v) if k in parts else v for k, v in values.items()})
+        return cls(**{k: type(parts[k])(**v) if is_dataclass(parts[k]) else v for k, v in values.items()})

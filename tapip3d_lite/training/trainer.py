@@ -18,19 +18,19 @@ from torch import Tensor, nn
 
 from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.blocks import Block
-from tapip3d_lite.model.registry import load_part
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import load_weights, save_weights
-from tapip3d_lite.training.accuracy import Accuracy
+from tapip3d_lite.model.windows import Step
+from tapip3d_lite.speed.cuda_graph import CudaGraphStep, sync_free
 from tapip3d_lite.training.backward import add_gradients, losses
 from tapip3d_lite.training.data import Batch, FeatureCache
 from tapip3d_lite.training.examples import Examples
-from tapip3d_lite.training.optimizer import adamw, set_rate
+from tapip3d_lite.training.loss import accuracy, step_accuracy
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.pretrain import FramePair, matching_loss
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.run_folder import Bar, RunFolder
-from tapip3d_lite.training.schedule import Schedule
+from tapip3d_lite.training.schedule import Schedule, adamw
 
 
 class Trainer:
@@ -44,10 +44,7 @@ class Trainer:
         examples: its input, by step.
         step: number of steps done, of both stages together.
         schedule: how far the training has come.
-        recorded: on a GPU, record steps as CUDA graphs.
     """
-
-    recorded: bool = True
 
     def __init__(
         self,
@@ -106,55 +103,34 @@ class Trainer:
             _compile(self.tracker)
         self._enter_stage(saved)
 
-    def run(
-        self,
-        stop: Callable[[], bool] = lambda: False,
-        watch: Callable[[dict], None] = lambda line: None,
-        progress: bool = True,
-    ) -> bool:
+    def run(self, stop: Callable[[], bool] = lambda: False, progress: bool = True) -> bool:
         """Train until the end, or until `stop()` is true after a step; either way everything is saved.
 
-        Args:
-            stop: called after every step.
-            watch: called with every line of the log, e.g. by a live plot.
-            progress: show a bar with loss, accuracy, speed and remaining time.
-
-        Returns:
-            Whether the training is finished.
-
-        Raises:
-            FloatingPointError: the loss or a gradient is not finite; the batch is saved in the folder.
+        Returns whether the training is finished. `progress` shows a bar with loss, accuracy, speed and remaining time. If
+        the loss or a gradient is not finite, the batch is saved in the folder, and a FloatingPointError raised.
         """
-        with Bar.open(self.schedule.position, self.config.total, progress and self.group.is_main) as bar:
+        with Bar(self.schedule.position, self.config.total, progress and self.group.is_main) as bar:
             for line in self.steps(stop):
                 bar.show(line, self.schedule.position)
-                watch(line)
         return self.schedule.finished
 
     def steps(self, stop: Callable[[], bool] = lambda: False) -> Iterator[dict]:
         """Train like `run`, and yield each step's line of the log, so that the caller can do something between steps.
 
-        Args:
-            stop: called when the caller asks for the next step; if true, everything is saved instead.
-
-        Raises:
-            FloatingPointError: the loss or a gradient is not finite; the batch is saved in the folder.
+        When the caller asks for the next step and `stop()` is true, everything is saved instead.
         """
         self.schedule.start_clock()
         halted = False
         while not self.schedule.finished and not halted:
             yield self._one_step()
             halted = self.group.sum(stop()) > 0
-            if halted or self.schedule.finished or self.step % self.config.save_every == 0:
-                self.save()
+            due = halted or self.schedule.finished or self.step % self.config.save_every == 0
+            if due and self.group.is_main:
+                state = {"model": self.tracker.state_dict(), "optimizer": self.optimizer.state_dict()}
+                state |= {"step": self.step, "position": self.schedule.position, "seconds": self.seconds}
+                self.folder.save(state)
         if self.schedule.finished and self.group.is_main:
             save_weights(self.tracker, self.folder.path / "weights.safetensors", half=True)
-
-    def save(self) -> None:
-        """Write the checkpoint atomically."""
-        if self.group.is_main:
-            state = {"model": self.tracker.state_dict(), "optimizer": self.optimizer.state_dict()}
-            self.folder.save(state | {"step": self.step, "position": self.schedule.position, "seconds": self.seconds})
 
     def example(self) -> list[FramePair] | Batch:
         """The input of the next step."""
@@ -165,19 +141,20 @@ class Trainer:
     def _one_step(self) -> dict:
         started, before, matching = time.perf_counter(), self.schedule.position, self.schedule.matching
         self.optimizer.zero_grad()
-        line = {"step": self.step + 1, "stage": "matching" if matching else "tracking"}
         example = self.example()
+        line = {"step": self.step + 1, "stage": "matching" if matching else "tracking"}
         line |= self._match(example) if matching else self._track(example)
         self.group.average(self.parameters)
         norm = float(nn.utils.clip_grad_norm_(self.parameters, self.schedule.recipe.clip_norm))
         if not np.isfinite([line["loss"], norm]).all():
             raise FloatingPointError(self.folder.save_failure(line, norm, self._drawn))
-        rate = self.schedule.rate()
-        set_rate(self.optimizer, *rate)
+        lr, beta1 = self.schedule.rate()
+        for group in self.optimizer.param_groups:
+            group |= {"lr": lr, "betas": (beta1, group["betas"][1])}
         self.optimizer.step()
         self.step += 1
         self.seconds += time.perf_counter() - started
-        line |= {"norm": norm, "lr": rate[0], "seconds": self.seconds}
+        line |= {"norm": norm, "lr": lr, "seconds": self.seconds}
         self.schedule.advance(self.step)
         if matching and not self.schedule.matching:
             self._enter_stage(None)
@@ -198,18 +175,20 @@ class Trainer:
     def _track(self, batch: Batch) -> dict:
         batch = batch.to(self.device)
         self._drawn = {"names": batch.names, "queries": batch.queries, "truth": vars(batch.truth)}
-        run = self._add_gradients if self._replay is None else self._replay
-        parts, seen = run(batch, batch.iterations)
-        return losses(parts) | Accuracy.result(seen)
+        parts, seen = (self._replay or self._add_gradients)(batch, batch.iterations)
+        return losses(parts) | accuracy(seen)
 
     def _add_gradients(self, batch: Batch, iterations: int) -> tuple[Tensor, Tensor]:
-        accuracy = Accuracy(batch.queries.device)
-        options = {"iterations": iterations, "depth_roi": batch.roi, "features": batch.features}
-        options |= {"watch": lambda step: accuracy.add(step, batch, iterations)}
-        free = load_part("tapip3d_lite.speed.cuda_graph:sync_free")(self.tracker) if self._replay else nullcontext()
-        with free, self._precision():
-            example = batch.frames, batch.queries, batch.truth
-            return add_gradients(self.tracker, *example, self.config.loss, **options), accuracy.totals
+        seen = torch.zeros(2, 2, device=batch.queries.device)
+
+        def watch(step: Step) -> None:
+            if step.iteration == iterations - 1:
+                seen.add_(step_accuracy(step, batch.truth, batch.dynamic))
+
+        options = {"iterations": iterations, "depth_roi": batch.roi, "features": batch.features, "watch": watch}
+        example = batch.frames, batch.queries, batch.truth
+        with sync_free(self.tracker) if self._replay else nullcontext(), self._precision():
+            return add_gradients(self.tracker, *example, self.config.loss, **options), seen
 
     def _precision(self) -> torch.autocast:
         return torch.autocast(self.device, torch.bfloat16, enabled=self.config.precision == "bfloat16")
@@ -221,11 +200,7 @@ class Trainer:
         self.tracker.requires_grad_(not matching)
         self.tracker.encoder.requires_grad_(matching or self.config.train_encoder)
         self.parameters = [p for p in self.tracker.parameters() if p.requires_grad]
-        self._replay = None
-        if self.recorded and self._on_gpu:
-            self._replay = load_part("tapip3d_lite.speed.cuda_graph:CudaGraphStep")(
-                self._add_gradients, self.parameters
-            )
+        self._replay = CudaGraphStep(self._add_gradients, self.parameters) if self._on_gpu else None
         self.optimizer = adamw(self.parameters, recipe.lr, recipe.weight_decay, fused=self._on_gpu)
         if saved is not None:
             self.optimizer.load_state_dict(saved["optimizer"])
