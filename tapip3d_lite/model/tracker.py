@@ -161,14 +161,9 @@ class Tracker(nn.Module):
     def scene(
         self, frames: Frames, features: Tensor, space: Any, depth_roi: tuple[float, float] | None, start: int = 0
     ) -> Scene:
-        """Lift frames to a feature cloud; frames and features are padded to whole half windows.
+        """Lift T frames with features (B, T, C, h, w) to a feature cloud in `space`, padded to whole half windows.
 
-        Args:
-            frames: T frames.
-            features: (B, T, C, h, w).
-            space: where the points shall lie.
-            depth_roi: depths (near, far) that count for the scale, or None.
-            start: which frame of the clip is the first.
+        `start` says which frame of the clip is the first; `depth_roi` as for `steps`.
         """
         with torch.autocast(frames.depths.device.type, enabled=False):
             half = self.config.window // 2
@@ -184,15 +179,10 @@ class Tracker(nn.Module):
             return Scene(frames, points, inside, levels, space, start)
 
     def support(self, scene: Scene, queries: Tensor, coords: Tensor) -> list[Neighbors]:
-        """The queries' neighbourhoods, at each level, in un-normalised coordinates.
+        """The neighbourhoods of queries (B, N, 4) in their frames, un-normalised: L times (B, N, 1 + K, ...).
 
-        Args:
-            scene: all frames up to the last query's.
-            queries: (B, N, 4), of which only t is read.
-            coords: (B, N, 3), the queries in the scene's space.
-
-        Returns:
-            L times (B, N, 1 + K, ...); the first row is the query itself, with index -1.
+        `coords` (B, N, 3) are the queries in the scene's space, and its frames must reach to the last one's. The first
+        row of each neighbourhood is the query itself, with index -1.
         """
         with torch.autocast(coords.device.type, enabled=False):
             return query_support(self.neighborhood, scene, queries[..., 0].long(), coords)

@@ -41,15 +41,18 @@ class CudaGraphStep:
     Each recording keeps a step's memory for itself, so a recipe of many lengths needs as many times as much.
     """
 
-    def __init__(self, run: Callable[[Any, int], tuple[Tensor, ...]], parameters: Sequence[nn.Parameter]) -> None:
+    def __init__(
+        self, step: Callable[[Any, int], tuple[Tensor, ...]], tracker: nn.Module, parameters: Sequence[nn.Parameter]
+    ) -> None:
         """Prepare to record.
 
         Args:
-            run: from a batch and M to tensors; leaves gradients. It must wait for no number: see `sync_free`. A batch is
-                anything with `frames` and `map(function of a tensor)`.
+            step: from a batch and M to tensors; leaves gradients. A batch is anything with `frames` and `map(function of a
+                tensor)`.
+            tracker: which it trains; `sync_free` while it is recorded.
             parameters: that get gradients.
         """
-        self._run, self._parameters, self._recorded = run, list(parameters), {}
+        self._step, self._tracker, self._parameters, self._recorded = step, tracker, list(parameters), {}
 
     def __call__(self, batch: Any, iterations: int) -> tuple[Tensor, ...]:
         """What `run` returns, overwritten by the next call; gradients are set, not added."""
@@ -63,6 +66,10 @@ class CudaGraphStep:
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         return results
+
+    def _run(self, batch: Any, iterations: int) -> tuple[Tensor, ...]:
+        with sync_free(self._tracker):
+            return self._step(batch, iterations)
 
     def _record(self, batch: Any, iterations: int) -> tuple:
         inputs, side, graph = batch.map(torch.clone), torch.cuda.Stream(), torch.cuda.CUDAGraph()

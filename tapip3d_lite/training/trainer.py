@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +17,10 @@ from torch import Tensor, nn
 
 from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.blocks import Block
+from tapip3d_lite.model.registry import fast_step
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import load_weights, save_weights
 from tapip3d_lite.model.windows import Step
-from tapip3d_lite.speed.cuda_graph import CudaGraphStep, sync_free
 from tapip3d_lite.training.backward import add_gradients, losses
 from tapip3d_lite.training.data import Batch, FeatureCache
 from tapip3d_lite.training.examples import Examples
@@ -187,7 +186,7 @@ class Trainer:
 
         options = {"iterations": iterations, "depth_roi": batch.roi, "features": batch.features, "watch": watch}
         example = batch.frames, batch.queries, batch.truth
-        with sync_free(self.tracker) if self._replay else nullcontext(), self._precision():
+        with self._precision():
             return add_gradients(self.tracker, *example, self.config.loss, **options), seen
 
     def _precision(self) -> torch.autocast:
@@ -200,7 +199,8 @@ class Trainer:
         self.tracker.requires_grad_(not matching)
         self.tracker.encoder.requires_grad_(matching or self.config.train_encoder)
         self.parameters = [p for p in self.tracker.parameters() if p.requires_grad]
-        self._replay = CudaGraphStep(self._add_gradients, self.parameters) if self._on_gpu else None
+        fast = fast_step(self.device)
+        self._replay = None if fast is None else fast(self._add_gradients, self.tracker, self.parameters)
         self.optimizer = adamw(self.parameters, recipe.lr, recipe.weight_decay, fused=self._on_gpu)
         if saved is not None:
             self.optimizer.load_state_dict(saved["optimizer"])

@@ -8,7 +8,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tapip3d_lite.model.blocks import DEGREES
 from tapip3d_lite.model.neighbors import KNearest
-from tapip3d_lite.speed.cuda_graph import CudaGraphStep
+from tapip3d_lite.speed.cuda_graph import CudaGraphStep, sync_free
 from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.trainer import Trainer
 from tests.tiny import recipe
@@ -55,24 +55,23 @@ def alike(some, others):
     return all(float((a - b).norm()) < 1e-4 * float(a.norm()) + 2e-8 for a, b in zip(some, others, strict=True))
 
 
-def test_a_steady_step_has_the_same_gradients(trainer):
+def test_a_sync_free_step_has_the_same_gradients(trainer):
     batch = trainer.example()
     assert int(batch.truth.times.max()) >= 4  # so that some tracks join later
     line, plain = gradients(trainer, batch)
-    trainer._replay = trainer._add_gradients
-    steady_line, steady = gradients(trainer, batch)
-    assert steady_line == pytest.approx(line, rel=1e-5) and not trainer.tracker.sync_free
-    assert alike(plain, steady)
+    with sync_free(trainer.tracker):
+        free_line, free = gradients(trainer, batch)
+    assert free_line == pytest.approx(line, rel=1e-5) and not trainer.tracker.sync_free
+    assert alike(plain, free)
 
 
-def test_a_steady_step_reads_no_number_from_the_device(trainer):
+def test_a_sync_free_step_reads_no_number_from_the_device(trainer):
     batch = trainer.example().to("cpu")
     trainer._add_gradients(batch, 2)  # constants are made
     with Reads() as reads:
         trainer._add_gradients(batch, 2)
     assert {"aten._local_scalar_dense.default", "aten.nonzero.default"} <= set(reads.names)  # an ordinary one does
-    trainer._replay = trainer._add_gradients
-    with Reads() as reads:
+    with sync_free(trainer.tracker), Reads() as reads:
         trainer._add_gradients(batch, 2)
     assert not reads.names
 
@@ -114,7 +113,7 @@ def test_a_recording_is_made_for_each_length_and_gets_each_batch(trainer, monkey
     batches = [trainer.examples.batch(step, step) for step in range(3)]
     expected = [gradients(trainer, batch) for batch in batches]
     monkeypatch.setattr(CudaGraphStep, "_record", record)
-    trainer._replay = CudaGraphStep(trainer._add_gradients, trainer.parameters)
+    trainer._replay = CudaGraphStep(trainer._add_gradients, trainer.tracker, trainer.parameters)
     for batch, (line, plain) in zip(batches, expected, strict=True):
         again, replayed = gradients(trainer, batch)
         assert again == pytest.approx(line, rel=1e-5)
