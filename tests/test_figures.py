@@ -35,11 +35,16 @@ def test_3d_scene_keeps_ranges_and_has_a_step_for_each_frame(clip):
     layout = figure.layout
     assert len(figure.frames) == len(layout.sliders[0].steps) == 5
     assert [f.name for f in figure.frames] == [s.args[0][0] for s in layout.sliders[0].steps] == list("01234")
-    assert layout.uirevision == "keep" and layout.scene.aspectmode == "data"
+    assert layout.uirevision == "keep" and layout.scene.aspectmode == "manual"
     for step in layout.sliders[0].steps:
         assert step.args[1]["mode"] == "immediate" and step.args[1]["frame"]["redraw"] is True
-    for axis in (layout.scene.xaxis, layout.scene.yaxis, layout.scene.zaxis):
-        assert axis.autorange is False and axis.range[0] < axis.range[1]
+    for name in "xyz":
+        axis, ratio = layout.scene[f"{name}axis"], layout.scene.aspectratio[name]
+        assert axis.autorange is False and axis.range[0] < axis.range[1] and "scene units" in axis.title.text
+        # One scale for all axes, whatever a frame shows.
+        assert ratio / (axis.range[1] - axis.range[0]) == pytest.approx(
+            layout.scene.aspectratio.x / np.ptp(layout.scene.xaxis.range)
+        )
     for frame in figure.frames:
         cloud, tails, heads = frame.data
         assert 0 < len(cloud.x) <= 300 and np.isfinite(cloud.x).all() and np.asarray(cloud.x).dtype == np.float32

@@ -128,7 +128,7 @@ def test_the_scene_has_a_step_for_each_k(clip, objects, track):
         assert list(frame.data[0].marker.color) == [RIGHT if r else WRONG for r in around.right["knn"]]
         np.testing.assert_allclose(frame.data[1].z, around.points("window")[:, 2], rtol=1e-6)
     assert (
-        figure.layout.scene.aspectmode == "data"
+        figure.layout.scene.aspectmode == "manual"
         and figure.layout.scene.yaxis.range[0] > figure.layout.scene.yaxis.range[1]
     )
 

@@ -211,3 +211,8 @@ def test_every_public_name_resolves():
         assert getattr(t3d, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         t3d.nonsense  # noqa: B018
+
+
+def test_no_test_module_imports_another():
+    for path in (ROOT / "tests").rglob("*.py"):
+        assert not re.search(r"^(from|import) tests\.test_", path.read_text(), re.M), path.name

@@ -19,7 +19,7 @@ from lessons.samples import SAMPLES
 from lessons.widgets import explore
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.figures.flat import INK, check_drawable, draw_image, label_axes
-from tapip3d_lite.figures.scene_3d import animation_args, axis_limits
+from tapip3d_lite.figures.scene_3d import animation_args, axis_limits, fixed_axes
 from tapip3d_lite.geometry import project, transform, unproject
 
 __all__ = [
@@ -165,13 +165,13 @@ def neighborhoods_3d(
     fixed = [_markers(cloud, "scene", 3, colors), _markers(query, "query", 7, QUERY, symbol="diamond")]
     figure = go.Figure(data=[*fixed, *frames[0].data], frames=frames)
     limits = axis_limits(np.concatenate([cloud, query, *(steps[-1].points(kind) for kind in NAMES)]))
-    axes = {f"{k}axis": {"range": r.tolist(), "autorange": False} for k, r in zip("xyz", limits, strict=True)}
+    axes = fixed_axes(limits)
     axes["yaxis"]["range"].reverse()  # the image's y points down
     view = {"up": {"x": 0, "y": 1, "z": 0}, "eye": {"x": -1.6, "y": 0.7, "z": -0.9}}
     args = animation_args(0)
     steps_of_k = [{"label": str(k), "method": "animate", "args": [[str(k)], args]} for k in counts]
     figure.update_layout(
-        scene=axes | {"aspectmode": "data", "camera": view},
+        scene=axes | {"camera": view},
         height=460,
         margin={"l": 0, "r": 0, "t": 34, "b": 0},
         uirevision="keep",

@@ -152,20 +152,32 @@ def axis_limits(xyz: np.ndarray) -> np.ndarray:
     return np.stack([low, high], -1) + 0.03 * (high - low).max() * np.array([-1, 1])
 
 
+def fixed_axes(limits: np.ndarray) -> dict[str, object]:
+    """Axes of a plotly scene with limits (3, 2) and equal scales, which stay as they are while its frames change.
+
+    The aspect mode "data" would scale the axes anew by the points of each frame: what rests would slide.
+    """
+    sizes = np.ptp(limits, axis=-1)
+    axes = {f"{k}axis": {"range": r.tolist(), "autorange": False} for k, r in zip("xyz", limits, strict=True)}
+    return axes | {"aspectmode": "manual", "aspectratio": _xyz(sizes / np.prod(sizes) ** (1 / 3))}
+
+
 def _scene(clip: Clip, tracks: Tracks) -> dict[str, object]:
     """Axes with fixed ranges, seen from behind and above the clip's first camera."""
     steps = np.linspace(0, len(clip) - 1, min(len(clip), 6)).astype(int)
     cloud = np.concatenate([_cloud_points(clip, t, 800)[0] for t in steps])
     ranges = axis_limits(np.concatenate([cloud, tracks.xyz[steps].reshape(-1, 3)]))
-    axis = {"showspikes": False, "title": {"font": {"size": 10}}, "tickfont": {"size": 9}, "backgroundcolor": "#f4f5f7"}
-    axes = {f"{k}axis": axis | {"range": r.tolist(), "autorange": False} for k, r in zip("xyz", ranges, strict=True)}
+    style = {"showspikes": False, "tickfont": {"size": 9}, "backgroundcolor": "#f4f5f7"}
+    scene = fixed_axes(ranges)
+    for k in "xyz":
+        scene[f"{k}axis"] |= style | {"title": {"text": f"{k} (scene units)", "font": {"size": 10}}}
     up, target = _up(clip), np.median(cloud, axis=0)
     back = invert(clip.extrinsics[0])[:3, 3] - target
     eye = target + 1.2 * back + 0.3 * np.linalg.norm(back) * up
-    # With aspectmode "data" a scene unit is the geometric mean of the three ranges, counted from their middle.
+    # The camera's unit is the geometric mean of the three ranges, counted from their middle.
     unit, middle = np.prod(np.ptp(ranges, axis=-1)) ** (1 / 3), ranges.mean(-1)
     camera = {"up": up, "eye": (eye - middle) / unit, "center": (target - middle) / unit}
-    return axes | {"aspectmode": "data", "camera": {name: _xyz(vector) for name, vector in camera.items()}}
+    return scene | {"camera": {name: _xyz(vector) for name, vector in camera.items()}}
 
 
 def _up(clip: Clip) -> np.ndarray:
