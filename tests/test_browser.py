@@ -126,13 +126,6 @@ def test_a_notebook_runs_and_its_figures_follow_their_controls(path, lab, page):
 
 
 SCENE = """g => {
-    // Where on the screen the low corner of the axes is: a point that rests.
-    const times = (m, v) => [0, 1, 2, 3].map(i => m[i] * v[0] + m[i + 4] * v[1] + m[i + 8] * v[2] + m[i + 12] * v[3])
-    const corner = (p, s) => {
-        const low = [s.xaxis, s.yaxis, s.zaxis].map((axis, i) => axis.range[0] * s._scene.dataScale[i])
-        const clip = times(p.projection, times(p.view, times(p.model, [...low, 1])))
-        return [clip[0] / clip[3], clip[1] / clip[3]]
-    }
     // Numbers of a frame that was not shown yet are still packed.
     const types = { f4: Float32Array, f8: Float64Array }
     const unpack = x => new types[x.dtype](Uint8Array.from(atob(x.bdata), c => c.charCodeAt()).buffer)
@@ -145,7 +138,9 @@ SCENE = """g => {
         frames: frames.map(frame => frame.data.map(trace => plain(trace.x))),
         eye: g._fullLayout.scene.camera.eye,
         aspect: g._fullLayout.scene._scene.glplot.getAspectratio(),
-        corner: corner(g._fullLayout.scene._scene.glplot.cameraParams, g._fullLayout.scene),
+        // The box that is drawn, in the data's units.
+        box: g._fullLayout.scene._scene.glplot.bounds.map(
+            side => Array.from(side).map((x, i) => x / g._fullLayout.scene._scene.dataScale[i])),
     }
 }"""
 
@@ -160,11 +155,13 @@ def move_slider(page, scene):
     page.mouse.click(rail["x"] + wanted / last * rail["width"], rail["y"] + rail["height"] / 2)
     same = f"([g, points]) => JSON.stringify(({SCENE})(g).shown) === JSON.stringify(points)"
     until(page, same, [scene.element_handle(), before["frames"][wanted]])
+    page.wait_for_timeout(500)  # the scene is drawn with its new points
     after = scene.evaluate(SCENE)
     assert after["active"] == wanted != before["active"]
     assert after["shown"] == after["frames"][wanted] != before["shown"]
     assert after["eye"] == before["eye"] and after["aspect"] == before["aspect"]  # what rests must not slide
-    assert after["corner"] == pytest.approx(before["corner"], abs=1e-3)
+    for one, other in zip(after["box"], before["box"], strict=True):
+        assert one == pytest.approx(other, rel=1e-3)
 
 
 # What an explorer shows: a digest of its picture's bytes, or why there is none.

@@ -63,6 +63,13 @@ def test_outputs_are_fresh_and_clean(path):
 
 
 @each_notebook
+def test_links_lead_somewhere(path):
+    for cell in read(path).cells:
+        for target in re.findall(r"\]\(([\w./-]+)[)#]", cell.source) if cell.cell_type == "markdown" else ():
+            assert (path.parent / target).exists(), target
+
+
+@each_notebook
 def test_checked_cells_have_outputs(path):
     for cell in code_cells(read(path)):
         if "nbval-check-output" in tags(cell):
