@@ -97,7 +97,7 @@ class Attention(nn.Module):
 
     def _heads(self, x: Tensor, context: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         k, v = self.to_kv(context).chunk(2, -1)
-        return tuple(y.unflatten(-1, (self.heads, -1)).transpose(-2, -3) for y in (self.to_q(x), k, v))
+        return tuple(y.unflatten(-1, (self.heads, -1)).transpose(-2, -3) for y in (self.to_q(x), k, v))  # heads first
 
 
 class Block(nn.Module):

@@ -39,7 +39,7 @@ class Level:
     def cells(self, uv: Tensor, size: tuple[int, int]) -> Tensor:
         """Pixels (..., 2) of images (H, W) in units of cells, (u w / W, v h / H): the features' convention."""
         height, width = self.points.shape[2:4]
-        return torch.stack([uv[..., 0] * width / size[1], uv[..., 1] * height / size[0]], -1)
+        return torch.stack([uv[..., 0] * width / size[1], uv[..., 1] * height / size[0]], -1)  # (..., 2)
 
     def cut(self, start: int, stop: int) -> Level:
         """Frames [start, stop)."""
@@ -67,7 +67,7 @@ def feature_cloud(features: Tensor, points: Tensor, valid: Tensor, levels: int) 
         L levels, finest first.
     """
     batch, count = features.shape[:2]
-    maps, cloud = features.flatten(0, 1), []
+    maps, cloud = features.flatten(0, 1), []  # (B T, C, h, w)
     for level in range(levels):
         maps = F.avg_pool2d(maps, 2) if level else maps  # (B T, C, h, w)
         rows = nearest_exact(points.shape[2], maps.shape[-2], points.device)
@@ -129,7 +129,7 @@ class Normalizer:
         axes = (1, 2) if mode == "isotropic" else 1
         total = count * 3 if mode == "isotropic" else count
         std = (square.sum(axes, keepdim=True) / total).sqrt()
-        return cls(mean[:, None], std[:, None].clamp(min=1e-12), scale)
+        return cls(mean[:, None], std[:, None].clamp(min=1e-12), scale)  # (B, 1, 1, 3 or 1)
 
     def normalize(self, x: Tensor) -> Tensor:
         """(B, ..., 3) to normalised coordinates."""

@@ -41,7 +41,7 @@ class Neighbors:
     @property
     def offsets(self) -> Tensor:
         """(..., N, K, 3), cell minus centre."""
-        return self.points - self.center.unsqueeze(-2)
+        return self.points - self.center.unsqueeze(-2)  # (..., N, 1, 3)
 
     def pick(self, columns: Tensor) -> Neighbors:
         """Some of the N points of (B, N, ...) neighbourhoods."""
@@ -78,7 +78,7 @@ class KNearest(nn.Module):
         with torch.no_grad():
             indices = self.search(level, coords.flatten(0, 1), points, valid)  # (B S, N, K)
         near = (gather(x, indices).unflatten(0, frames) for x in (features, points))  # (B, S, N, K, ...)
-        return Neighbors(*near, coords, indices.unflatten(0, frames))
+        return Neighbors(*near, coords, indices.unflatten(0, frames))  # (B, S, N, K)
 
     def search(self, level: Level, queries: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:
         """Indices (F, N, K) of the cells (F, P, 3) of `level` nearest to queries (F, N, 3); valid (F, P) may be chosen."""
@@ -113,7 +113,7 @@ def knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = None
 def _nearest(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) -> Tensor:
     distance = squared_distances(queries, points)  # (F, N, P)
     if valid is not None:
-        distance.masked_fill_(~valid[:, None], torch.inf)
+        distance.masked_fill_(~valid[:, None], torch.inf)  # (F, 1, P)
     return nearest_first(distance, torch.arange(distance.shape[-1], device=distance.device), count, valid is not None)
 
 
@@ -140,7 +140,7 @@ def nearest_first(distance: Tensor, indices: Tensor, count: int, masked: bool) -
 
 def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
     """(F, N, P) = dx^2 + dy^2 + dz^2; never through |a|^2 + |b|^2 - 2ab, which loses the near ones to rounding."""
-    total = (queries[:, :, None, 0] - points[:, None, :, 0]).square_()
+    total = (queries[:, :, None, 0] - points[:, None, :, 0]).square_()  # (F, N, 1) - (F, 1, P)
     for axis in (1, 2):
         total += (queries[:, :, None, axis] - points[:, None, :, axis]).square_()
     return total
@@ -148,7 +148,7 @@ def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
 
 def gather(values: Tensor, indices: Tensor) -> Tensor:
     """Rows of values (F, P, C) at indices (F, N, K) as (F, N, K, C)."""
-    first = torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1]
+    first = torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1]  # (F, 1, 1)
     rows = values.flatten(0, 1).index_select(0, (first + indices).flatten())  # its backward needs no sorting on a GPU
     return rows.view(*indices.shape, values.shape[2])  # (F N K, C) -> (F, N, K, C)
 

@@ -74,7 +74,7 @@ class First(Space):
     def fit(self, depths: Tensor, extrinsics: Tensor) -> Space:
         """The space of clips whose first cameras have poses (B, 4, 4)."""
         space = First()
-        space.anchor = extrinsics[:, None]
+        space.anchor = extrinsics[:, None]  # (B, 1, 4, 4)
         return space
 
     def lift(self, depths: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:

@@ -108,7 +108,7 @@ class Stream:
 
     def _begin(self, rows: np.ndarray) -> None:
         """Trajectories of no frames yet, of queries (N, 4) and the support grid's."""
-        self.rows = torch.from_numpy(rows).to(next(self.tracker.parameters()).device)[None]
+        self.rows = torch.from_numpy(rows).to(next(self.tracker.parameters()).device)[None]  # (1, N, 4)
         nothing = self.rows.new_zeros(1, 0, len(rows), 3)
         self.state = State(nothing, nothing[..., 0], nothing.new_zeros(1, len(rows), 3), self.rows[..., 0].long())
 
@@ -119,7 +119,7 @@ class Stream:
         self.cameras.append((frames.intrinsics, frames.extrinsics, depth))
         arriving = state.times[0] == self.seen
         if bool(arriving.any()):
-            mine = self.rows[:, None, arriving, 1:]
+            mine = self.rows[:, None, arriving, 1:]  # (1, 1, n, 3)
             state.queries[:, arriving] = self.space.from_world(mine, frames.intrinsics, frames.extrinsics)[:, 0]
             state.coords[:, :, arriving] = state.queries[:, None, arriving]
         state.coords = torch.cat([state.coords, state.queries[:, None]], 1)  # (1, T, N, 3)

@@ -80,7 +80,7 @@ def track(
         if backward:
             flipped = [_flip_time(rows, len(clip)) for rows in (queries, grids[1])]
             other = _one_way(ways[1], *flipped, options)
-            before = np.arange(len(clip))[:, None] < queries[:, 0]
+            before = np.arange(len(clip))[:, None] < queries[:, 0]  # (T, N)
             xyz = np.where(before[..., None], other[0][::-1], xyz)
             logits = np.where(before, other[1][::-1], logits)
     visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= threshold

@@ -170,7 +170,7 @@ class Tracker(nn.Module):
             padding = -len(frames) % half
             frames = frames.pad(half)
             if padding:
-                features = torch.cat([features, features[:, -1:].expand(-1, padding, -1, -1, -1)], 1)
+                features = torch.cat([features, features[:, -1:].expand(-1, padding, -1, -1, -1)], 1)  # (B, T, …)
             points = space.lift(frames.depths, frames.intrinsics, frames.extrinsics)  # (B, T, H, W, 3)
             known = inside = frames.depths > 0
             if depth_roi is not None:

@@ -139,7 +139,7 @@ class State:
             raise ValueError(
                 f"queries: t must be in [0, {len(frames) - 1}], got {int(times.min())}..{int(times.max())}"
             )
-        batch = torch.arange(len(queries), device=queries.device)[:, None]
+        batch = torch.arange(len(queries), device=queries.device)[:, None]  # (B, 1)
         with torch.autocast(queries.device.type, enabled=False):
             cameras = frames.intrinsics[batch, times], frames.extrinsics[batch, times]  # (B, N, ...)
             coords = space.from_world(queries[..., None, 1:], *cameras)[:, :, 0]
@@ -174,7 +174,7 @@ class State:
 
     def write(self, start: int, stop: int, columns: Tensor, active: Tensor, coords: Tensor, logits: Tensor) -> None:
         """Overwrite the window's frames, the overlap with the window before included."""
-        mask = active[:, None]
+        mask = active[:, None]  # (B, 1, n)
         old = self.coords[:, start:stop, columns], self.logits[:, start:stop, columns]
         self.coords[:, start:stop, columns] = torch.where(mask[..., None], coords, old[0])
         self.logits[:, start:stop, columns] = torch.where(mask, logits, old[1])
@@ -224,7 +224,7 @@ def around_queries(neighborhood: Callable[..., Neighbors], scene: Scene, level: 
     cells = level.cells(scene.space.to_pixels(coords, frames.intrinsics, frames.extrinsics), frames.size)
     near = neighborhood(level, coords, cells)  # (B, T, N, K, ...)
     own = bilinear(level.features.flatten(0, 1), cells.flatten(0, 1)).unflatten(0, coords.shape[:2])  # (B, T, N, C)
-    features = torch.cat([own.unsqueeze(3), near.features], 3)
-    points = torch.cat([near.center.unsqueeze(3), near.points], 3)
+    features = torch.cat([own.unsqueeze(3), near.features], 3)  # (B, T, N, 1 + K, C)
+    points = torch.cat([near.center.unsqueeze(3), near.points], 3)  # (B, T, N, 1 + K, 3)
     first = None if near.indices is None else torch.full_like(near.indices[..., :1], -1)
     return Neighbors(features, points, coords, None if first is None else torch.cat([first, near.indices], 3))
