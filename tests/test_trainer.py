@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
 from tapip3d_lite.files import load_npz
 from tapip3d_lite.lab import make_trainer
 from tapip3d_lite.training.augment import AugmentConfig
-from tapip3d_lite.training.data import SamplingConfig, pick_frames
+from tapip3d_lite.training.data import FeatureCache, SamplingConfig, pick_frames
 from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.pretrain import MatchingConfig, draw_pair
 from tapip3d_lite.training.recipe import TrainConfig
@@ -164,6 +165,20 @@ def test_weights_to_start_from(tmp_path, clips):
         Trainer(tmp_path / "third", recipe(**init, tracker=SIZES | {"hidden": 16}), clips)
     with pytest.raises(ValueError, match="static: no such file"):
         Trainer(tmp_path / "fourth", recipe(init="static"), clips)
+
+
+def test_features_belong_to_a_clips_content_not_to_its_name(tmp_path, clips):
+    twins = [tmp_path / folder / "clip.npz" for folder in ("one", "other")]
+    for twin, clip in zip(twins, clips, strict=False):
+        twin.parent.mkdir()
+        shutil.copy(clip, twin)
+    encoder = t3d.Tracker(t3d.TrackerConfig.preset("lite", **SIZES)).encoder
+    cache = FeatureCache(tmp_path / "features", encoder, (32, 32))
+    (tmp_path / "features").mkdir()
+    index = np.arange(3)
+    one, other = (cache.frames(twin, index) for twin in twins)
+    assert not torch.equal(one, other) and len(list((tmp_path / "features").iterdir())) == 2
+    assert torch.equal(FeatureCache(tmp_path / "features", encoder, (32, 32)).frames(clips[0], index), one)
 
 
 def test_a_disk_without_room_for_the_features_is_noticed_before_training(tmp_path, clips, monkeypatch):

@@ -7,6 +7,7 @@ ours are simulated.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -208,10 +209,14 @@ def make_batch(clips: list[Clip], features: list[Tensor] | None = None, iteratio
 
 
 class FeatureCache:
-    """Features of whole clips by a frozen encoder, stored as float16 files that are written when first needed."""
+    """Features of whole clips by a frozen encoder, stored as float16 files that are written when first needed.
+
+    A file is named by its clip's content, since clips in two folders may bear one name.
+    """
 
     def __init__(self, folder: str | Path, encoder: Encoder, size: tuple[int, int]) -> None:
         self.folder, self.encoder, self.size = Path(folder), encoder, size
+        self._paths: dict[Path, Path] = {}
 
     def check_room(self, clips: Sequence[Path]) -> None:
         """Raise a ValueError with the sizes if the features of these clips do not fit on the disk."""
@@ -226,7 +231,10 @@ class FeatureCache:
             )
 
     def _path(self, clip: Path) -> Path:
-        return self.folder / f"{clip.stem}.npy"
+        if clip not in self._paths:
+            content = hashlib.sha256(clip.read_bytes()).hexdigest()
+            self._paths[clip] = self.folder / f"{clip.stem}-{content[:16]}.npy"
+        return self._paths[clip]
 
     @torch.no_grad()
     def frames(self, clip: Path, index: np.ndarray) -> Tensor:
