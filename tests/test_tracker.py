@@ -400,6 +400,12 @@ def test_a_bar_that_is_redrawn_at_every_update(monkeypatch):
     assert f"{total}/{total}" in shown.getvalue() and total > 2
 
 
+def test_a_space_may_be_a_name_a_class_or_an_object(golden):
+    tracker, inputs = golden.tracker, (golden.frames, golden.queries)
+    results = [tracker(*inputs, space=space, iterations=1)[0] for space in ("world", World, World())]
+    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
 def test_official_parameters_are_strict(golden):
     state = {key[6:]: golden[key] for key in golden.arrays.files if key.startswith("param.")}
     name = "point_updater.flow_head.weight"

@@ -261,8 +261,9 @@ class Tracker(nn.Module):
         return Stream(self, queries, **options)
 
     def resolve_space(self, space: Any) -> Any:
-        """The space that a name or an object stands for; the tracker's own for None."""
-        return self.space if space is None else make_space(space) if isinstance(space, str) else space
+        """The space that a name, a class or an object stands for; the tracker's own for None."""
+        space = self.space if space is None else space
+        return make_space(space) if isinstance(space, str | type) else space
 
     def _check(self, frames: Frames, iterations: int) -> None:
         if frames.size != self.config.image_size:

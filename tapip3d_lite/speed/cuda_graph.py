@@ -55,7 +55,7 @@ class CudaGraphStep:
         self._step, self._tracker, self._parameters, self._recorded = step, tracker, list(parameters), {}
 
     def __call__(self, batch: Any, iterations: int) -> tuple[Tensor, ...]:
-        """What `run` returns, overwritten by the next call; gradients are set, not added."""
+        """What the step returns, overwritten by the next call; gradients are set, not added."""
         key = len(batch.frames), iterations
         if key not in self._recorded:
             self._recorded[key] = self._record(batch, iterations)
