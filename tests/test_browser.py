@@ -114,7 +114,7 @@ def test_a_notebook_runs_and_its_figures_follow_their_controls(path, lab, page):
     assert not [errors for _, errors in cells if errors]
 
     source = "\n".join(cell["source"] for cell in read_notebook(path)["cells"] if cell["cell_type"] == "code")
-    scenes, explorers = page.locator(".js-plotly-plot"), page.locator(".widget-vbox:has(> .widget-image)")
+    scenes, explorers = page.locator(".js-plotly-plot"), page.locator(".widget-vbox:has(> .widget-html img)")
     assert (scenes.count() > 0) == ("show_3d(" in source)
     assert explorers.count() == source.count("explore(")
     for i in range(scenes.count()):
@@ -166,9 +166,9 @@ def move_slider(page, scene):
 
 # What an explorer shows: a digest of its picture's bytes, or why there is none.
 SHOWN = """async explorer => {
-    const image = explorer.querySelector(':scope > .widget-image')
-    if (getComputedStyle(image).display === 'none') return explorer.querySelector(':scope > .widget-html').innerText
-    const bytes = await (await fetch(image.src)).arrayBuffer()
+    const [picture, refusal] = explorer.querySelectorAll(':scope > .widget-html')
+    if (getComputedStyle(picture).display === 'none') return refusal.innerText
+    const bytes = await (await fetch(picture.querySelector('img').src)).arrayBuffer()
     return new Uint8Array(await crypto.subtle.digest('SHA-256', bytes)).join()
 }"""
 

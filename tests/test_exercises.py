@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from lessons.checker import Exercise, Mistake, all_exercises, check, compare, judge, score_guess
+from lessons import progress
+from lessons.checker import Exercise, Mistake, all_exercises, check, judge
+from lessons.compare import compare, describe
+from lessons.guesses import reveal
 from tests.exercise_matrix import table
 
 EXERCISES = all_exercises()
@@ -107,14 +110,50 @@ def test_compare():
     assert compare(np.array([np.nan]), np.array([np.nan]), 1e-6) == ""
 
 
-def test_guesses():
-    score = score_guess
-    assert score(None, 3.0, "px").status == "not attempted"
-    assert "3 px" in str(score(None, 3.0, "px"))
-    assert (score(2.9, 3.0).status, score(6, 3.0).status) == ("passed", "wrong")
-    assert "2 times" in str(score(6, 3.0))
-    assert (score("a lot", 3.0).status, score("world", "world").status) == ("wrong", "passed")
-    assert (score("World", "world").status, score("uvd", "world").status) == ("passed", "wrong")
+def scored(guess, truth, **options):
+    return reveal(guess, truth, **options).verdict
+
+
+def test_a_guess_is_sealed_until_it_is_made():
+    shown = []
+    sealed = reveal(None, 3.0, unit="px", then=lambda: shown.append(1))
+    assert sealed.verdict.status == "sealed" and "3" not in str(sealed.verdict)
+    sealed._ipython_display_()
+    assert not shown
+    opened = reveal("show me", 3.0, unit="px", then=lambda: shown.append(1))
+    assert opened.verdict.status == "shown" and "3 px" in str(opened.verdict)
+    opened._ipython_display_()
+    assert shown
+    assert (
+        scored("three", 3.0).status == scored(float("nan"), 3.0).status == "sealed"
+    )  # no number: nothing is given away
+
+
+@pytest.mark.parametrize(
+    ("guess", "truth", "options", "status", "why"),
+    [
+        (1.0, 1.17, {"null": 1}, "wrong", "there is an effect"),
+        (1.1, 1.17, {"null": 1}, "passed", "sign and size"),
+        (1.3, 1.17, {"null": 1}, "passed", "sign and size"),
+        (2.0, 1.17, {"null": 1}, "wrong", "too large"),
+        (0.9, 1.17, {"null": 1}, "wrong", "sign"),
+        (0.75, 1.0, {"null": 1}, "wrong", "there is no effect"),
+        (1.0, 1.0, {"null": 1}, "passed", "no effect"),
+        (-1.0, 1.17, {"null": 1}, "wrong", "positive"),
+        (0.0, -0.09, {"null": 0}, "wrong", "there is an effect"),
+        (0.1, -0.09, {"null": 0}, "wrong", "sign"),
+        (-0.15, -0.09, {"null": 0}, "passed", "sign and size"),
+        (6, 3.0, {}, "passed", "size"),
+        (7, 3.0, {}, "wrong", "2.3 times too large"),
+        (1, 3.0, {}, "wrong", "3 times too small"),
+        ("World", "world", {}, "passed", "world"),
+        ("uvd", "world", {"choices": ("world", "uvd")}, "wrong", "world"),
+        ("a lot", "world", {"choices": ("world", "uvd")}, "sealed", "expected one of world, uvd"),
+    ],
+)
+def test_guesses_are_scored_by_sign_and_size(guess, truth, options, status, why):
+    verdict = scored(guess, truth, **options)
+    assert verdict.status == status and why in verdict.message
 
 
 def test_verdicts_show_themselves():
@@ -130,3 +169,77 @@ def test_exercises_are_found_by_their_notebooks_number():
     for name in ("99.nothing", "", "../03.knn"):
         with pytest.raises(ValueError, match=r"no exercise .* there are 00.lift, .*06.backward$"):
             check(name, len)
+
+
+def test_a_hint_needs_agreement_on_every_case():
+    same_for_one = Mistake(
+        "doubled", lambda x: x + x[0], "you added the first value."
+    )  # right and wrong meet at size 1
+    double = Exercise("test.double", lambda x: 3 * x, lambda rng, size: (rng.normal(size=size),), (same_for_one,))
+    assert judge(double, lambda x: 2 * x).hint == ""
+    assert judge(double, lambda x: x + x[0]).hint == "you added the first value."
+
+
+def test_gradients_and_cost_are_judged():
+    square = Exercise("test.square", lambda x: x**2, lambda rng, n: (torch.ones(n),), (), gradients=(0,))
+    assert judge(square, lambda x: x * x).status == "passed"
+    cut = judge(square, lambda x: x.detach() * x)
+    assert cut.status == "wrong" and "gradient with respect to argument 1" in cut.message
+    assert "gradient" in judge(square, lambda x: x.detach() ** 2).message
+
+    def visits(answer, arguments):
+        seen = []
+        answer(Visited(arguments[0], seen))
+        return len(seen)
+
+    class Visited(list):
+        def __init__(self, values, seen):
+            super().__init__(values)
+            self.seen = seen
+
+        def __getitem__(self, i):
+            self.seen.append(i)
+            return super().__getitem__(i)
+
+    def all_of_it(x):
+        return [x[i] for i in range(len(x))][0]
+
+    first = Exercise(
+        "test.first", lambda x: x[0], lambda rng, n: (list(range(n + 1)),), (Mistake("all", all_of_it, "stop early."),),
+        cost=visits, cost_unit="values read",
+    )  # fmt: skip
+    assert "values read" in judge(first, lambda x: x[0]).message
+    dear = judge(first, all_of_it)
+    assert dear.status == "wrong" and "too dear: 2 values read, where 1 are enough" in dear.message
+    assert dear.hint == "stop early."
+
+
+def test_single_precision_is_accepted():
+    third = Exercise("test.third", lambda x: x / 3, lambda rng, n: (rng.normal(size=n) * 1e4,), (), tolerance=1e-9)
+    assert judge(third, lambda x: (x / 3).astype(np.float32)).status == "passed"
+    assert judge(third, lambda x: x / 3 + 1).status == "wrong"
+
+
+def test_failures_are_compact(double):
+    def long(x):
+        raise ValueError("no " * 1000)
+
+    assert len(str(judge(double, long))) < 600
+    assert len(describe((np.ones((50, 50)), [1] * 100, "x" * 1000))) <= 300
+
+
+def test_progress_keeps_what_passed_and_forgets_on_demand(capsys):
+    progress.reset()
+    reference = EXERCISES["01.unproject"].reference
+    assert progress.in_use("01.unproject") is reference and "until yours passes" in capsys.readouterr().out
+
+    def mine(*arguments):
+        return reference(*arguments)
+
+    check("01.unproject", mine)
+    assert progress.in_use("01.unproject") is mine and "yours" in capsys.readouterr().out
+    assert "✓ 01.unproject: passed, 1 try" in str(progress.progress("01"))
+    check("01.unproject", lambda *a: mine(*a) + 1)
+    assert progress.in_use("01.unproject") is reference
+    assert "· 01.unproject: wrong, 2 tries" in str(progress.progress("01"))
+    assert "01.unproject" in str(progress.reset("01")) and "nothing" in str(progress.reset("01"))

@@ -1,14 +1,14 @@
 """Checked exercises: the learner's function against a reference on random cases, from small to large.
 
-A wrong answer is shown the smallest case on which it fails, where it differs, and a hint. The hint is chosen by what
-the answer computes: if it agrees with a known mistake on that case, it gets the hint for that mistake. The exercises of
-notebook 03 are in `n03.EXERCISES`, and so on.
+An answer is judged by its values, where the exercise says so also by its gradients and by what it cost. A wrong one is
+shown the smallest case on which it fails, the first place that differs, and a hint if it is a known mistake: one that
+computes the same as the answer on *every* case, since on a single small one quite different mistakes agree. The
+exercises of notebook 03 are in `n03.EXERCISES`, and so on.
 """
 
 from __future__ import annotations
 
 import copy
-import html
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,8 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lessons import progress
+from lessons.compare import compare, describe, short
+from lessons.verdict import Verdict
+
 Answer = Callable[..., object]
-_ICONS = {"passed": ("✓", "#1a7f37"), "wrong": ("✗", "#b42318"), "not attempted": ("○", "#57606a")}
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,14 @@ class Exercise:
     Attributes:
         name: `"<notebook>.<function>"`, e.g. `"01.unproject"`.
         reference: the right answer.
-        cases: (random generator, size) to a tuple of arguments; size runs from 1 to 4.
+        cases: (random generator, size) to a tuple of arguments; size runs from 1 to 4, three cases each.
         mistakes: typical wrong answers with their hints.
         tolerance: largest absolute or relative difference that still is right.
+        gradients: places among the arguments of float tensors whose gradient must be right, too.
+        cost: (answer, arguments) to a number that must not exceed the reference's by more than `slack`, e.g. the cells
+            that the answer visited; it calls the answer itself.
+        cost_unit: what the number counts, e.g. `"cells visited"`.
+        slack: how many times the reference's cost is still accepted.
     """
 
     name: str
@@ -53,36 +61,31 @@ class Exercise:
     cases: Callable[[np.random.Generator, int], tuple]
     mistakes: tuple[Mistake, ...]
     tolerance: float = 1e-4
+    gradients: tuple[int, ...] = ()
+    cost: Callable[[Answer, tuple], float] | None = None
+    cost_unit: str = ""
+    slack: float = 1.0
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What a checker says; shows itself as the last line of a notebook cell.
+class Outcome:
+    """What a function made of one case: a value, or the error that it raised; its gradients; its cost."""
 
-    Attributes:
-        status: `"passed"`, `"wrong"` or `"not attempted"`.
-        message: in words.
-        hint: for a recognised mistake, else empty.
-    """
+    value: object = None
+    error: Exception | None = None
+    gradients: tuple = ()
+    cost: float | None = None
 
-    status: str
-    message: str
-    hint: str = ""
-
-    def __str__(self) -> str:
-        lines = [f"{_ICONS[self.status][0]} {self.status}: {self.message}"]
-        return "\n".join([*lines, f"Hint: {self.hint}"] if self.hint else lines)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        _, color = _ICONS[self.status]
-        style = f"border-left:4px solid {color};padding:2px 10px;white-space:pre-wrap;font-family:monospace"
-        return f'<div style="{style}">{html.escape(str(self))}</div>'
+    @property
+    def empty(self) -> bool:
+        """Whether the function is still a stub."""
+        return isinstance(self.error, NotImplementedError) or (
+            self.error is None and (self.value is None or self.value is Ellipsis)
+        )
 
 
 def check(name: str, answer: Answer) -> Verdict:
-    """Judge a learner's function.
+    """Judge a learner's function, and keep it for `progress.in_use` if it is right.
 
     Args:
         name: the exercise, e.g. `"01.unproject"`.
@@ -91,10 +94,17 @@ def check(name: str, answer: Answer) -> Verdict:
     Raises:
         ValueError: there is no such exercise.
     """
+    verdict = judge(find(name), answer)
+    progress.record(name, answer, verdict.status)
+    return verdict
+
+
+def find(name: str) -> Exercise:
+    """The exercise of a name; ValueError if there is none."""
     known = {exercise.name: exercise for exercise in exercises_of(name[:2])}
     if name not in known:
         raise ValueError(f"check: no exercise {name!r}; there are {', '.join(known or all_exercises())}")
-    return judge(known[name], answer)
+    return known[name]
 
 
 def exercises_of(notebook: str) -> tuple[Exercise, ...]:
@@ -110,122 +120,95 @@ def all_exercises() -> dict[str, Exercise]:
     return {exercise.name: exercise for number in numbers for exercise in exercises_of(number)}
 
 
+def cases_of(exercise: Exercise) -> list[tuple]:
+    """The twelve cases of an exercise, from small to large; always the same."""
+    return [exercise.cases(np.random.default_rng([size, seed]), size) for size in (1, 2, 3, 4) for seed in range(3)]
+
+
 def judge(exercise: Exercise, answer: Answer) -> Verdict:
     """Run an answer on random cases of growing size and say how it did."""
-    for size in (1, 2, 3, 4):
-        for seed in range(3):
-            arguments = exercise.cases(np.random.default_rng([size, seed]), size)
-            expected = exercise.reference(*_copied(arguments))
-            try:
-                got = answer(*_copied(arguments))
-            except NotImplementedError:
-                return _not_attempted()
-            except Exception as error:
-                message = f"{_crash(error)}\nThe input was {describe(arguments)}"
-                return Verdict("wrong", message, _hint(exercise, arguments, error))
-            if got is None or got is Ellipsis:
-                return _not_attempted()
-            difference = compare(got, expected, exercise.tolerance)
-            if difference:
-                message = f"{difference}\nThe input was {describe(arguments)}"
-                return Verdict("wrong", message, _hint(exercise, arguments, got))
-    return Verdict("passed", "agrees with the reference on 12 random cases.")
+    cases, outcomes, fault = cases_of(exercise), [], ""
+    for arguments in cases:
+        got = run(exercise, answer, arguments)
+        if got.empty and not fault:
+            return Verdict("not attempted", "the function still returns nothing; fill in the stub and run both cells.")
+        outcomes.append(got)
+        if not fault:
+            fault = difference(exercise, got, run(exercise, exercise.reference, arguments), by_cost=True)
+            if fault:
+                fault = f"{fault}\nThe input was {describe(arguments)}"
+    if fault:
+        return Verdict("wrong", fault, recognised(exercise, cases, outcomes))
+    counted = ["values"] + ["gradients"] * bool(exercise.gradients) + [exercise.cost_unit] * (exercise.cost is not None)
+    return Verdict("passed", f"agrees with the reference on {len(cases)} random cases ({', '.join(counted)}).")
 
 
-def compare(got: object, expected: object, tolerance: float) -> str:
-    """Where and how two results differ, in words; empty if they agree."""
-    if isinstance(expected, tuple):
-        if not isinstance(got, tuple | list) or len(got) != len(expected):
-            return f"expected {len(expected)} results, got {describe((got,))}"
-        parts = (compare(g, e, tolerance) for g, e in zip(got, expected, strict=True))
-        return next((f"result {i}: {p}" for i, p in enumerate(parts) if p), "")
+def run(exercise: Exercise, answer: Answer, arguments: tuple) -> Outcome:
+    """What an answer makes of a case; the case stays as it is, whatever the answer does to its arguments."""
+    mine = copy.deepcopy(arguments)
+    leaves = [mine[place].requires_grad_() for place in exercise.gradients]
     try:
-        a, b = np.asarray(got), np.asarray(expected)
-        if a.dtype.kind not in "biuf":
-            return f"expected numbers, got {type(got).__name__}"
-    except (TypeError, ValueError, RuntimeError):
-        return f"expected an array, got {type(got).__name__}"
-    if a.shape != b.shape:
-        return f"expected shape {b.shape}, got {a.shape}"
-    if b.ndim and a.dtype.kind == "f" and b.dtype.kind in "bi":
-        return f"expected whole numbers ({b.dtype}), got {a.dtype}"
-    same = np.isclose(a.astype(float), b.astype(float), rtol=tolerance, atol=tolerance, equal_nan=True)
-    if same.all():
-        return ""
-    lost = ", among them NaN" if np.isnan(a[~same].astype(float)).any() else ""
-    where = tuple(int(i) for i in np.argwhere(~same)[0])
-    place = f"at index {where}: " if where else ""
-    share = f"{(~same).sum()} of {same.size} values differ{lost}"
-    return f"{place}expected {_number(b[where])}, got {_number(a[where])} ({share})"
+        value = answer(*mine)
+        value = tuple(value) if isinstance(value, list) else value
+        outcome = Outcome(value, gradients=_gradients(value, leaves) if leaves else ())
+        if outcome.empty or exercise.cost is None:
+            return outcome
+        return Outcome(value, None, outcome.gradients, exercise.cost(answer, copy.deepcopy(arguments)))
+    except Exception as error:
+        return Outcome(error=error)
 
 
-def describe(arguments: tuple) -> str:
-    """Arguments of a call on a few lines: small arrays whole, larger ones by their shape."""
-    return ", ".join(_described(a) for a in arguments)
-
-
-def score_guess(guess: float | str | None, truth: float | str, unit: str = "") -> Verdict:
-    """Compare a committed prediction with what was measured; a guess that is None spoils nothing.
+def difference(exercise: Exercise, got: Outcome, expected: Outcome, by_cost: bool = False) -> str:
+    """Where and how two outcomes differ, in words; empty if they agree.
 
     Args:
-        guess: the reader's number or word.
-        truth: the measured number or word.
-        unit: printed behind the numbers.
+        exercise: says what is compared, and how closely.
+        got: the answer's.
+        expected: the reference's.
+        by_cost: only too high a cost counts, and only by the exercise's slack; else any other cost does.
     """
-    if guess is None:
-        return Verdict("not attempted", f"no guess committed; measured: {_number(truth)} {unit}".rstrip())
-    if isinstance(truth, str) or isinstance(guess, str):
-        right = str(guess).strip().lower() == str(truth).lower()
-        return Verdict("passed" if right else "wrong", f"you said {guess}; measured: {_number(truth)} {unit}".rstrip())
-    close = abs(float(guess) - truth) <= 0.25 * abs(truth)
-    factor = f", {float(guess) / truth:.2g} times as much" if truth else ""
-    return Verdict(
-        "passed" if close else "wrong", f"measured: {_number(truth)} {unit}; you said {_number(guess)}{factor}"
-    )
+    if got.error is not None or expected.error is not None:
+        return "" if type(got.error) is type(expected.error) else _crash(got.error)
+    fault = compare(got.value, expected.value, exercise.tolerance)
+    if fault:
+        return fault
+    for place, mine, right in zip(exercise.gradients, got.gradients, expected.gradients, strict=True):
+        fault = compare(mine, right, exercise.tolerance)
+        if fault:
+            return f"the values are right, the gradient with respect to argument {place + 1} is not: {fault}"
+    if got.cost is None or expected.cost is None:
+        return ""
+    limit = expected.cost * exercise.slack
+    if got.cost > limit if by_cost else got.cost != expected.cost:
+        return f"the values are right, but too dear: {got.cost:g} {exercise.cost_unit}, where {limit:g} are enough"
+    return ""
 
 
-def _not_attempted() -> Verdict:
-    return Verdict("not attempted", "the function still returns nothing; fill in the stub and run both cells again.")
-
-
-def _hint(exercise: Exercise, arguments: tuple, got: object) -> str:
+def recognised(exercise: Exercise, cases: list[tuple], outcomes: list[Outcome]) -> str:
+    """The hint of the mistake that computes what the answer computes on every case; empty if there is none."""
     for mistake in exercise.mistakes:
-        try:
-            known: object = mistake.answer(*_copied(arguments))
-        except Exception as error:
-            known = error
-        if isinstance(known, Exception) or isinstance(got, Exception):
-            if type(known) is type(got):
-                return mistake.hint
-        elif not compare(got, _tupled(known), exercise.tolerance):
+        pairs = zip(cases, outcomes, strict=True)
+        if not any(difference(exercise, got, run(exercise, mistake.answer, case)) for case, got in pairs):
             return mistake.hint
     return ""
 
 
-def _tupled(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
+def _gradients(value: object, leaves: list) -> tuple:
+    """Gradients of a weighted sum of all results; zeros where none flows."""
+    import torch
+
+    parts = [x for x in (value if isinstance(value, tuple) else (value,)) if isinstance(x, torch.Tensor)]
+    total = sum((x * torch.cos(torch.arange(x.numel()) + 1.0).view_as(x)).sum() for x in parts if x.requires_grad)
+    if not isinstance(total, torch.Tensor):
+        return tuple(torch.zeros_like(leaf) for leaf in leaves)
+    found = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+    return tuple(gradient.detach() for gradient in found)
 
 
-def _crash(error: Exception) -> str:
+def _crash(error: Exception | None) -> str:
+    if error is None:
+        return "expected an error, got a value"
     frames = traceback.extract_tb(error.__traceback__)[1:]
     own = [f for f in frames if f.filename == frames[0].filename]  # the learner's cell, not the library it calls
     where = f" (line {own[-1].lineno}: {own[-1].line})" if own else ""
-    return f"{type(error).__name__}: {error}{where}"
-
-
-def _copied(arguments: tuple) -> tuple:
-    return copy.deepcopy(arguments)  # an answer may change its arguments; arrays and tensors alike
-
-
-def _described(value: object) -> str:
-    value = value.detach().cpu().numpy() if hasattr(value, "detach") else value
-    if isinstance(value, np.ndarray):
-        small = value.size <= 12
-        return (
-            np.array2string(value, precision=3, suppress_small=True) if small else f"array {value.shape} {value.dtype}"
-        )
-    return f"{value:.4g}" if isinstance(value, float) else repr(value)
-
-
-def _number(value: object) -> str:
-    return str(value) if isinstance(value, str | bool | np.bool_) else f"{float(value):.4g}"
+    return f"{type(error).__name__}: {short(str(error))}{where}"

@@ -7,13 +7,30 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from lessons.checker import Exercise, Mistake, check, score_guess
+from lessons.checker import Exercise, Mistake, check
+from lessons.guesses import reveal
+from lessons.milestone import milestone
 from lessons.n01 import random_extrinsics, random_intrinsics
+from lessons.pictures import pipeline, show
+from lessons.progress import collect, in_use, progress, reset
 from lessons.widgets import explore
 from tapip3d_lite.figures.flat import label_axes
 from tapip3d_lite.geometry import invert, transform, unproject
 
-__all__ = ["EXERCISES", "check", "explore", "score_guess", "scores_bar"]
+__all__ = [
+    "EXERCISES",
+    "check",
+    "collect",
+    "explore",
+    "in_use",
+    "milestone",
+    "pipeline",
+    "progress",
+    "reset",
+    "reveal",
+    "scores_bar",
+    "show",
+]
 
 Array = np.ndarray
 

@@ -6,11 +6,29 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lessons.checker import Exercise, Mistake, check, score_guess
+from lessons.checker import Exercise, Mistake, check
+from lessons.guesses import reveal
+from lessons.milestone import milestone
+from lessons.pictures import pipeline, show
+from lessons.progress import collect, in_use, progress, reset
 from lessons.widgets import explore
 from tapip3d_lite.geometry import invert, resize_intrinsics, transform, unproject
 
-__all__ = ["EXERCISES", "check", "explore", "random_extrinsics", "random_intrinsics", "score_guess"]
+__all__ = [
+    "EXERCISES",
+    "check",
+    "collect",
+    "explore",
+    "in_use",
+    "milestone",
+    "pipeline",
+    "progress",
+    "random_extrinsics",
+    "random_intrinsics",
+    "reset",
+    "reveal",
+    "show",
+]
 
 Array = np.ndarray
 

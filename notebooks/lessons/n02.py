@@ -6,9 +6,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lessons.checker import check, score_guess
+from lessons.checker import check
+from lessons.guesses import reveal
+from lessons.milestone import milestone
 from lessons.n02_exercises import EXERCISES
 from lessons.n02_straightness import SPACES, bend, fit_windows, stays_in_view, to_space
+from lessons.pictures import pipeline, show
+from lessons.progress import collect, in_use, progress, reset
 from lessons.widgets import explore
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.figures.flat import INK, MOVING, STILL, draw_image, label_axes
@@ -18,11 +22,18 @@ __all__ = [
     "SPACES",
     "bend",
     "check",
+    "collect",
     "explore",
     "fit_windows",
+    "in_use",
+    "milestone",
     "motion_fit",
     "paths_in_spaces",
-    "score_guess",
+    "pipeline",
+    "progress",
+    "reset",
+    "reveal",
+    "show",
     "stays_in_view",
     "to_space",
 ]

@@ -11,10 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from lessons.checker import check, score_guess
+from lessons.checker import check
+from lessons.guesses import reveal
+from lessons.milestone import milestone
 from lessons.n02_straightness import to_space
 from lessons.n03_cells import Cells, silhouettes, track_objects
 from lessons.n03_exercises import EXERCISES, search, walls
+from lessons.pictures import pipeline, show
+from lessons.progress import collect, in_use, progress, reset
 from lessons.samples import SAMPLES
 from lessons.widgets import explore
 from tapip3d_lite.clip import Clip
@@ -28,12 +32,19 @@ __all__ = [
     "Around",
     "Cells",
     "check",
+    "collect",
     "explore",
+    "in_use",
+    "milestone",
     "neighborhoods_3d",
+    "pipeline",
+    "progress",
     "proof_view",
-    "score_guess",
+    "reset",
+    "reveal",
     "search",
     "share_curves",
+    "show",
     "silhouettes",
     "to_space",
     "track_objects",

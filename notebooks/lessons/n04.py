@@ -12,9 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from matplotlib.ticker import ScalarFormatter
 
-from lessons.checker import check, score_guess
+from lessons.checker import check
+from lessons.guesses import reveal
+from lessons.milestone import milestone
 from lessons.n04_exercises import EXERCISES
 from lessons.n04_votes import paired_bags, similarity_attention, votes
+from lessons.pictures import pipeline, show
+from lessons.progress import collect, in_use, progress, reset
 from lessons.widgets import explore
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.figures.flat import INK, check_drawable, draw_image, label_axes
@@ -27,12 +31,19 @@ __all__ = [
     "WAYS",
     "AttentionPair",
     "check",
+    "collect",
     "entropy",
     "explore",
     "fourier_waves",
+    "in_use",
+    "milestone",
     "paired_bags",
+    "pipeline",
+    "progress",
     "rates",
-    "score_guess",
+    "reset",
+    "reveal",
+    "show",
     "similarity_attention",
     "two_bags",
     "votes",

@@ -14,8 +14,12 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from lessons.checker import check, score_guess
+from lessons.checker import check
+from lessons.guesses import reveal
+from lessons.milestone import milestone
 from lessons.n05_exercises import EXERCISES, hand_over
+from lessons.pictures import pipeline, show
+from lessons.progress import collect, in_use, progress, reset
 from lessons.widgets import explore
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.figures.flat import INK, check_drawable, draw_image, label_axes
@@ -28,12 +32,19 @@ from tapip3d_lite.model.tracker import Tracker
 __all__ = [
     "EXERCISES",
     "check",
+    "collect",
     "converging",
     "explore",
     "film",
+    "in_use",
+    "milestone",
     "paired",
+    "pipeline",
+    "progress",
     "random_tracker",
-    "score_guess",
+    "reset",
+    "reveal",
+    "show",
     "time_in_turns",
     "time_ratios",
     "token_bar",

@@ -12,10 +12,14 @@ from IPython.display import display
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lessons.checker import check, score_guess
+from lessons.checker import check
+from lessons.guesses import reveal
+from lessons.milestone import milestone
 from lessons.n06_augmentations import before_and_after, motion_paths
 from lessons.n06_chain import Chain
 from lessons.n06_exercises import EXERCISES
+from lessons.pictures import pipeline, show
+from lessons.progress import collect, in_use, progress, reset
 from lessons.saved_bytes import SavedBytes
 from lessons.widgets import explore
 from tapip3d_lite.clip import Clip, Tracks
@@ -33,10 +37,17 @@ __all__ = [
     "SavedBytes",
     "before_and_after",
     "check",
+    "collect",
     "explore",
+    "in_use",
     "learning_curve",
+    "milestone",
     "motion_paths",
-    "score_guess",
+    "pipeline",
+    "progress",
+    "reset",
+    "reveal",
+    "show",
     "tracks_and_truth",
     "train_live",
 ]

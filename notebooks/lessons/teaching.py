@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lessons.guesses import SHOW
 from lessons.tool import ToolParser
 from tapip3d_lite.files import atomic_path
 
@@ -24,6 +25,8 @@ _CODE = re.compile(r"<details>\s*<summary>Solution</summary>\s*```python\n(.*?)`
 _FOLD = re.compile(r"\s*<details>\s*<summary>Solution</summary>.*?</details>", re.DOTALL)
 _TITLE = re.compile(r"^#+ Exercise\s*([\d.]*)\s*[:·]\s*(.+)$", re.MULTILINE)
 _MINUTES = re.compile(r"(\d+)\s*min")
+_NO_GUESS = re.compile(r"^(\w+\s*=\s*)None", re.MULTILINE)
+_QUESTION = re.compile(r"^#+ [^\n]*In your own words[^\n]*\n(.*?)(?=^#|\Z)", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\[([^\]]*)\]\(\.\./tapip3d_lite[^)]*\)")
 
 
@@ -74,10 +77,13 @@ def solution_of(nb: Notebook, index: int) -> str:
 
 
 def solution_copy(nb: Notebook) -> Notebook:
-    """A copy in which every stub is replaced by the folded solution that follows it."""
+    """A copy in which every stub is replaced by the folded solution that follows it, and every seal is open."""
     filled = copy.deepcopy(nb)
     for i in stubs(nb):
         filled["cells"][i]["source"] = solution_of(nb, i)
+    for cell in filled["cells"]:
+        if "guess" in tags(cell):
+            cell["source"] = _NO_GUESS.sub(rf'\1"{SHOW}"', cell["source"])
     return filled
 
 
@@ -155,6 +161,24 @@ def timing_plan(notebooks: dict[str, Notebook], lesson: int = 45) -> str:
     return "\n".join(lines) + "\n"
 
 
+def question_of(nb: Notebook) -> str:
+    """The question that is to be answered in one's own words; ValueError where the notebook asks none."""
+    for cell in nb["cells"]:
+        found = _QUESTION.search(cell["source"]) if cell["cell_type"] == "markdown" else None
+        if found:
+            return found[1].strip()
+    raise ValueError("expected a text cell with a heading '… In your own words'")
+
+
+def model_answers(notebooks: Path) -> str:
+    """One page in Markdown: the questions to be answered in one's own words, and an answer to each."""
+    lines = ["# In your own words: the questions, and an answer to each", ""]
+    for path in sorted(notebooks.glob("[0-9][0-9]_*.ipynb")):
+        text = (notebooks / "lessons" / "answers" / f"{path.stem[:2]}.md").read_text(encoding="utf-8")
+        lines += [f"## {path.stem}", "", question_of(read_notebook(path)), "", text.strip(), ""]
+    return "\n".join(lines)
+
+
 def write_pack(notebooks: Path, out: Path, lesson: int = 45) -> list[Path]:
     """Write the pack: `student/` and `solution/` notebooks, `TIMING.md`, and what they load: clips and lessons.
 
@@ -176,6 +200,7 @@ def write_pack(notebooks: Path, out: Path, lesson: int = 45) -> list[Path]:
     for name, nb in course.items():
         for folder, version in (("student", nb), ("solution", solution_copy(nb))):
             files[out / folder / f"{name}.ipynb"] = json.dumps(handout(version), indent=1, ensure_ascii=False) + "\n"
+    files[out / "ANSWERS.md"] = model_answers(notebooks)
     for page in sorted(notebooks.glob("*.md")):
         text = _LINK.sub(r"\1", page.read_text(encoding="utf-8"))  # the code does not lie beside the pack
         files |= {out / folder / page.name: text for folder in ("student", "solution")}

@@ -8,16 +8,17 @@ from collections.abc import Callable, Sequence
 import ipywidgets as widgets
 from matplotlib.figure import Figure
 
-from tapip3d_lite.figures import png_bytes
+from lessons.pictures import image
 
 Control = tuple[int, int] | tuple[float, float] | Sequence[str]
 
 
-def explore(draw: Callable[..., Figure], **controls: Control) -> widgets.VBox:
+def explore(draw: Callable[..., Figure], *, alt: str = "The figure above.", **controls: Control) -> widgets.VBox:
     """Sliders and menus over a pure function `draw(**values) -> Figure`.
 
     Args:
         draw: returns a matplotlib figure; the notebook shows one static result of it above the explorer.
+        alt: what the figure shows, in a sentence.
         controls: argument name to (low, high) for a slider (whole numbers, or floats in 20 steps), or to a list of
             strings for a menu. The first value, or the middle of the range, is shown first.
 
@@ -25,12 +26,14 @@ def explore(draw: Callable[..., Figure], **controls: Control) -> widgets.VBox:
         The controls above the figure. A `ValueError` of `draw` is shown instead of the figure.
     """
     boxes = {name: _control(name, values) for name, values in controls.items()}
-    # An image, not an Output: programs that run notebooks (nbclient) may wait long for messages that Outputs send.
-    picture, refusal = widgets.Image(format="png", layout={"align_self": "flex-start"}), widgets.HTML()
+    # No Output: programs that run notebooks (nbclient) may wait long for messages that Outputs send.
+    picture, refusal = widgets.HTML(layout={"align_self": "flex-start"}), widgets.HTML()
 
     def redraw(_change: object = None) -> None:
         try:
-            picture.value = png_bytes(draw(**{name: box.value for name, box in boxes.items()}))
+            values = {name: box.value for name, box in boxes.items()}
+            setting = ", ".join(f"{name} {value}" for name, value in values.items())
+            picture.value = image(draw(**values), f"{alt} Shown with {setting}.")
             refusal.value = ""
         except ValueError as error:
             refusal.value = html.escape(str(error))

@@ -1,0 +1,106 @@
+"""Milestones: the learner's own functions at their places in the tracker, and the tracks that they give.
+
+Each lesson's `parts(use)` names places in the library, as `"module:attribute"`, and what stands there while the
+functions are plugged in: `use("01.unproject")` gives the learner's function, or the reference while there is none.
+Tracks are computed in double precision: the method amplifies differences of the last digit, and in single precision
+two right orders of summation could give different tracks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+
+import tapip3d_lite as t3d
+from lessons import progress
+from lessons.verdict import Verdict
+from tapip3d_lite.model.frames import Frames, frames_from_clip
+
+Use = Callable[[str], Callable[..., object]]
+CLIP = Path(__file__).parents[2] / "data_samples" / "handheld.npz"
+_FRAMES, _POINTS = 16, 16  # one window
+_METRES = 1e-3
+
+
+def milestone(*lessons: str) -> Verdict:
+    """Track a clip with the learner's functions of some lessons, e.g. `milestone("03")`, and compare with the library.
+
+    Passed: each function is the learner's, the tracker called each, and no point is off by a millimetre.
+    """
+    calls: dict[str, int] = {}
+    with plugged(lessons, calls):
+        mine = _tracks()
+    apart = float(np.abs(mine - _library()).max())
+    lines = [f"{len(calls)} functions in the tracker; tracks of {_POINTS} points over {_FRAMES} frames"]
+    for name, count in calls.items():
+        whose = "yours" if progress.is_yours(name) else "the reference, until yours passes"
+        lines.append(f"  {name}: {whose}, called {count} times")
+    lines.append(f"largest distance from the library's tracks: {1000 * apart:.4f} mm")
+    if not apart < _METRES or 0 in calls.values():
+        return Verdict("wrong", "\n".join(lines))
+    whole = all(progress.is_yours(name) for name in calls)
+    return Verdict("passed" if whole else "not attempted", "\n".join(lines))
+
+
+class plugged:
+    """A context in which the functions of some lessons stand in the library.
+
+    Args:
+        lessons: numbers, e.g. `("01", "03")`.
+        calls: is filled with the number of calls of each exercise's function.
+    """
+
+    def __init__(self, lessons: tuple[str, ...], calls: dict[str, int] | None = None) -> None:
+        self.calls = {} if calls is None else calls
+        self.places: dict[str, object] = {}
+        for lesson in lessons:
+            self.places |= import_module(f"lessons.n{lesson}").parts(self._use)
+        self._stack = ExitStack()
+
+    def _use(self, name: str) -> Callable[..., object]:
+        function = progress.in_use(name, quiet=True)
+        self.calls[name] = 0
+
+        def counted(*arguments: object, **named: object) -> object:
+            self.calls[name] += 1
+            return function(*arguments, **named)
+
+        return counted
+
+    def __enter__(self) -> plugged:
+        for place, part in self.places.items():
+            module, _, attribute = place.partition(":")
+            owner = import_module(module)
+            *path, last = attribute.split(".")
+            for name in path:
+                owner = getattr(owner, name)
+            self._stack.enter_context(mock.patch.object(owner, last, part))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+
+def frames_and_queries() -> tuple[Frames, torch.Tensor]:
+    """One window of a real clip and the queries of its first frame, (1, N, 4), in double precision."""
+    clip = t3d.load_clip(CLIP)
+    rows = clip.tracks.queries[clip.tracks.queries[:, 0] == 0]
+    queries = torch.from_numpy(rows[:: len(rows) // _POINTS][:_POINTS]).double()[None]
+    frames = frames_from_clip(clip).cut(0, _FRAMES)
+    return Frames(*(x.double() for x in (frames.rgb, frames.depths, frames.intrinsics, frames.extrinsics))), queries
+
+
+def _tracks() -> np.ndarray:
+    tracker = t3d.load_tracker("lite", fast=False).double()
+    with torch.no_grad():
+        return tracker(*frames_and_queries())[0].numpy()
+
+
+_library = cache(_tracks)
