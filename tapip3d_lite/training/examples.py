@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.files import load_npz
 from tapip3d_lite.simulate.dataset import leave_interrupts
+from tapip3d_lite.simulate.degrade import SensorConfig, degrade
 from tapip3d_lite.training.augment import augment
 from tapip3d_lite.training.data import Batch, FeatureCache, draw_frames, make_batch, pick_frames, sample_tracks
 from tapip3d_lite.training.motion import random_coordinates
@@ -79,6 +80,8 @@ class Examples(Dataset):
         clip = pick_frames(arrays, index, self.size)
         if config.augment:
             clip = augment(clip, rng, config.augmentation)
+        if rng.random() < config.sensor:
+            clip = degrade(clip, SensorConfig.draw(rng, images=self.cache is None), rng)
         clip = random_coordinates(sample_tracks(clip, rng, config.sampling), rng, config.motion)
         return clip, None if self.cache is None else self.cache.frames(path, index)
 

@@ -29,6 +29,11 @@ class MotionConfig:
         velocity, velocity_noise: greatest initial speed, and standard deviation of its changes, per frame.
         rotation, rotation_noise: the same for the rotation, in radians per frame.
         smoothing: of the changes over time, from 0 (none) to 1.
+        sliding: share of the examples in which the whole world slides at constant velocity, so that nothing rests.
+        slide: (least, greatest) speed per frame; drawn log-uniformly, so that creeping is as likely as flying.
+        wrong: share of the examples with wrong poses: each frame's camera is turned by one random angle, and drifts.
+        pose_noise: (least, greatest) standard deviation of that angle in degrees, drawn log-uniformly; the drift's
+            changes per frame have a tenth of it, and shift the camera as well.
 
     Raises:
         ValueError: a share outside [0, 1], or a negative velocity or rotation.
@@ -42,9 +47,16 @@ class MotionConfig:
     rotation: float = 0.03
     rotation_noise: float = 0.015
     smoothing: float = 0.8
+    sliding: float = 0.2
+    slide: tuple[float, float] = (0.002, 0.2)
+    wrong: float = 0.3
+    pose_noise: tuple[float, float] = (0.05, 2.5)
 
     def __post_init__(self) -> None:
-        check_range(self, 0, 1, "world", "turned", "still", "smoothing")
+        for name in ("slide", "pose_noise"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # lists come from JSON
+            check_range(self, 1e-9, math.inf, name)
+        check_range(self, 0, 1, "world", "turned", "still", "smoothing", "sliding", "wrong")
         check_range(self, 0, math.inf, "velocity", "velocity_noise", "rotation", "rotation_noise")
         if self.world + self.turned > 1:
             raise ValueError(f"MotionConfig: world + turned must be at most 1, got {self.world} + {self.turned}")
@@ -81,17 +93,49 @@ def move(clip: Clip, motion: np.ndarray) -> Clip:
 
 
 def random_coordinates(clip: Clip, rng: np.random.Generator, config: MotionConfig) -> Clip:
-    """Leave a clip in its world frame, rotate that frame, or move everything to the camera frame and then smoothly on."""
+    """Leave a clip in its world frame, rotate that frame, or move everything to the camera frame and then smoothly on.
+
+    A share of the examples then gets wrong poses, and a share slides.
+    """
+    motion, frames = np.eye(4)[None], len(clip)
+    extrinsics = clip.extrinsics.astype(np.float64)
     kind = rng.random()
-    if kind < config.world:
-        return clip
-    if kind < config.world + config.turned:
+    if rng.random() < config.wrong:
+        error = pose_error(rng, frames, _log_uniform(rng, config.pose_noise))
+        motion = invert(error @ extrinsics) @ extrinsics
+    if config.world <= kind < config.world + config.turned:
         turn = np.eye(4)
         turn[:3, :3] = _random_rotation(rng)
-        return move(clip, np.repeat(turn[None], len(clip), 0))
-    still = rng.random() < config.still
-    motion = np.eye(4) if still else smooth_motion(rng, len(clip), config)
-    return move(clip, motion @ clip.extrinsics.astype(np.float64))
+        motion = turn @ motion
+    elif kind >= config.world:
+        still = rng.random() < config.still
+        motion = (np.eye(4) if still else smooth_motion(rng, frames, config)) @ extrinsics
+    if rng.random() < config.sliding:
+        motion = slide(rng, frames, _log_uniform(rng, config.slide)) @ motion
+    return move(clip, np.broadcast_to(motion, (frames, 4, 4)))
+
+
+def pose_error(rng: np.random.Generator, frames: int, degrees: float) -> np.ndarray:
+    """Rigid errors (T, 4, 4) of cameras: in each frame one angle N(0, sigma) about a random axis (as the paper's), and drift."""
+    drift = np.cumsum(0.1 * np.radians(degrees) * rng.normal(size=(frames, 6)), 0)
+    axes = rng.normal(size=(frames, 3))
+    turns = axes / np.linalg.norm(axes, axis=-1, keepdims=True) * np.radians(degrees) * rng.normal(size=(frames, 1))
+    error = np.repeat(np.eye(4)[None], frames, 0)
+    error[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in turns + drift[:, :3]]
+    error[:, :3, 3] = drift[:, 3:]
+    return error
+
+
+def slide(rng: np.random.Generator, frames: int, speed: float) -> np.ndarray:
+    """A translation (T, 4, 4) of constant velocity in a random direction."""
+    direction = rng.normal(size=3)
+    motion = np.repeat(np.eye(4)[None], frames, 0)
+    motion[:, :3, 3] = np.arange(frames)[:, None] * speed * direction / np.linalg.norm(direction)
+    return motion
+
+
+def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    return float(np.exp(rng.uniform(*np.log(bounds))))
 
 
 def _random_rotation(rng: np.random.Generator) -> np.ndarray:

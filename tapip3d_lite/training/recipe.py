@@ -44,6 +44,7 @@ class TrainConfig:
         evaluate_every: steps between evaluations on held-out clips.
         validation: number of held-out clips.
         save_every: steps between checkpoints.
+        sensor: share of the examples whose depth (and image, where it is encoded anew) is that of a poor sensor.
         augment: apply `augmentation` to the images of both stages; needs `train_encoder`, since stored features cannot
             follow changed images.
 
@@ -74,6 +75,7 @@ class TrainConfig:
     validation: int = 8
     save_every: int = 250
     augment: bool = False
+    sensor: float = 0.4
     loss: LossConfig = field(default_factory=lambda: LossConfig(visibility=0.5))
     motion: MotionConfig = field(default_factory=MotionConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)

@@ -1,0 +1,134 @@
+"""Sensor-like depth and soft images: what a real camera does to a perfect clip; the true tracks stay true.
+
+    z' = r_t z (1 + noise) + z^2 grain,  then steps of disparity, flying pixels and holes
+
+The grain of a depth from stereo or structured light grows with the square of the distance, since disparity goes with
+1 / z; at silhouettes such sensors mix front and back, and see nothing beside them or at grazing angles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.validate import check_range
+
+_EDGE = 0.08  # neighbouring depths that differ by this share belong to two surfaces
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """Strength of each flaw; 0 is none. `SensorConfig.draw` draws all of them for a training clip.
+
+    Attributes:
+        flicker: standard deviation of the factor by which a whole frame's depth is wrong.
+        noise: standard deviation of each pixel's relative error, independent in each frame.
+        grain: the same in metres at a distance of one metre; grows with the square of the distance.
+        step: smallest difference of disparity that is told apart, as a share of the disparity at one metre.
+        flying: share of the pixels along silhouettes that show a depth between front and back.
+        shadow: width of the holes beside silhouettes, in pixels of a width of 128.
+        grazing: surfaces whose ray meets them at less than this angle (degrees) have no depth.
+        dropout: share of the pixels without depth, at random places.
+        blur: standard deviation of the image's blur, in pixels of a width of 128.
+
+    Raises:
+        ValueError: a negative strength, or a share above 1.
+    """
+
+    flicker: float = 0.0
+    noise: float = 0.0
+    grain: float = 0.0
+    step: float = 0.0
+    flying: float = 0.0
+    shadow: float = 0.0
+    grazing: float = 0.0
+    dropout: float = 0.0
+    blur: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_range(self, 0, np.inf, "flicker", "noise", "grain", "step", "shadow", "blur")
+        check_range(self, 0, 1, "flying", "dropout")
+        check_range(self, 0, 90, "grazing")
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, share: float = 0.5, images: bool = True) -> SensorConfig:
+        """Strengths for a training clip: each flaw occurs in a share of the clips, from just noticeable to strong."""
+        ranges = {
+            "flicker": (0.002, 0.04),
+            "noise": (0.005, 0.08),
+            "grain": (0.0005, 0.006),
+            "step": (0.0005, 0.004),
+            "flying": (0.1, 1.0),
+            "shadow": (0.5, 4.0),
+            "grazing": (3.0, 15.0),
+            "dropout": (0.02, 0.6),
+        } | ({"blur": (0.3, 2.5)} if images else {})
+        return cls(**{k: float(np.exp(rng.uniform(*np.log(v)))) for k, v in ranges.items() if rng.random() < share})
+
+
+def degrade(clip: Clip, config: SensorConfig, seed: int | np.random.Generator = 0) -> Clip:
+    """The clip as a sensor would give it: depths and images change, cameras, queries and true tracks do not.
+
+    Args:
+        clip: any clip.
+        config: how strong each flaw is.
+        seed: a number or a generator; the same seed gives the same clip.
+    """
+    rng, unit = np.random.default_rng(seed), clip.size[1] / 128
+    depths = clip.depths
+    edge = _silhouettes(depths) if config.flying or config.shadow else None
+    away = _grazing(clip, config.grazing) if config.grazing else None
+    shape = depths.shape
+    if config.flying:
+        near, far = cv2_each(cv2.erode, depths), cv2_each(cv2.dilate, depths)
+        mixed = near + rng.random(shape, np.float32) * (far - near)
+        depths = np.where(edge & (rng.random(shape) < config.flying) & (depths > 0) & (near > 0), mixed, depths)
+    scale = np.exp(config.flicker * rng.standard_normal((len(depths), 1, 1)))
+    depths = depths * scale * (1 + config.noise * rng.standard_normal(shape, np.float32))
+    depths = depths + config.grain * depths**2 * rng.standard_normal(shape, np.float32)
+    if config.step:
+        disparity = np.rint(np.divide(1, depths, out=np.zeros_like(depths), where=depths > 0) / config.step)
+        depths = np.divide(1 / config.step, disparity, out=np.zeros_like(depths), where=disparity > 0)
+    lost = rng.random(shape) < config.dropout
+    if config.shadow:
+        lost |= np.stack([_widened(e, config.shadow * unit) for e in edge])
+    if away is not None:
+        lost |= away
+    depths = np.where(lost | (clip.depths <= 0) | (depths <= 0), 0, depths).astype(np.float32)
+    if not depths.any():  # nothing would be left to track in
+        depths = clip.depths
+    video = clip.video
+    if config.blur:
+        video = np.stack([cv2.GaussianBlur(frame, (0, 0), config.blur * unit) for frame in video])
+    return replace(clip, depths=depths, video=video)
+
+
+def cv2_each(change: object, depths: np.ndarray) -> np.ndarray:
+    """A 3 x 3 operation of OpenCV on each frame."""
+    return np.stack([change(frame, np.ones((3, 3), np.uint8)) for frame in depths])
+
+
+def _silhouettes(depths: np.ndarray) -> np.ndarray:
+    """Pixels (T, H, W) whose neighbourhood holds two surfaces."""
+    near, far = cv2_each(cv2.erode, depths), cv2_each(cv2.dilate, depths)
+    return (far - near) > _EDGE * np.maximum(near, 1e-3)
+
+
+def _widened(mask: np.ndarray, width: float) -> np.ndarray:
+    """A mask (H, W) grown to the right by a width in pixels: the side that one of a sensor's two eyes cannot see."""
+    grown = np.zeros_like(mask)
+    for shift in range(round(width)):
+        grown[:, shift:] |= mask[:, : mask.shape[1] - shift]
+    return grown
+
+
+def _grazing(clip: Clip, angle: float) -> np.ndarray:
+    """Pixels (T, H, W) where the ray meets the surface at less than an angle in degrees."""
+    fx, fy = (clip.intrinsics[:, i, i, None, None] for i in (0, 1))
+    depths = np.maximum(clip.depths, 1e-6)
+    down, right = np.gradient(np.log(depths), axis=(1, 2))
+    # A plane that the axis meets at an angle a has |d log z / d (u / f)| = 1 / tan a.
+    return np.hypot(right * fx, down * fy) > 1 / np.tan(np.radians(angle))
