@@ -1,4 +1,4 @@
-"""The clips of the Lite benchmark: three splits, stored as rollouts, rendered on first use and compared with fingerprints.
+"""The clips of the Lite benchmark: three splits and four hard ones, stored as rollouts, rendered on first use and compared with fingerprints.
 
 The files in `lite_benchmark/` hold the results of the physics, so that every machine scores the same clips; each clip's
 fingerprint reveals a change of the renderer that would silently change the scores.
@@ -18,19 +18,36 @@ from tqdm import tqdm
 from tapip3d_lite.clip import Clip, load_clip
 from tapip3d_lite.simulate import Rollout, render_clip
 from tapip3d_lite.simulate.dataset import run_jobs
+from tapip3d_lite.simulate.degrade import SensorConfig, degrade, wrong_poses
 from tapip3d_lite.simulate.rollout import load_rollouts
 
 FOLDER = Path(__file__).parent / "lite_benchmark"
 SPLITS = ("static-camera", "moving-camera", "occlusion")
+HARD = ("slow", "drift", "sensor", "portrait")
+DRIFT = (0.25, 0.5, 1.0, 2.0)  # degrees of pose error, clip by clip
 COUNT = 16
 Job = tuple[Path, str, Rollout, dict[str, np.ndarray]]  # file in the cache, name, what to render, fingerprint
 SLACK = {"tracks": 2, "depths": 4, "visible": 0, "video": 4}  # millimetres, millimetres, bits, grey levels
 
 
 def check_split(split: str) -> None:
-    """Raise ValueError for a split that is none of `SPLITS`."""
-    if split not in SPLITS:
-        raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got {split!r}; choose one of them")
+    """Raise ValueError for a split that is none of `SPLITS` and `HARD`."""
+    if split not in (*SPLITS, *HARD):
+        raise ValueError(f"split: expected one of {', '.join((*SPLITS, *HARD))}, got {split!r}; choose one of them")
+
+
+def split_file(split: str) -> Path:
+    """Where a split's rollouts are stored."""
+    return FOLDER / ("hard" if split in HARD else "") / f"{split}.npz"
+
+
+def flawed(clip: Clip, split: str, index: int) -> Clip:
+    """A rendered clip of a split with what reality does to it: wrong poses in `drift`, a poor sensor in `sensor`."""
+    if split == "drift":
+        return wrong_poses(clip, DRIFT[index % len(DRIFT)], seed=index)
+    if split == "sensor":
+        return degrade(clip, SensorConfig.draw(np.random.default_rng([1, index]), share=0.6), seed=index)
+    return clip
 
 
 def fingerprint(clip: Clip) -> dict[str, np.ndarray]:
@@ -69,7 +86,7 @@ def benchmark_clips(split: str, count: int | None = None, progress: bool = True)
     check_split(split)
     if count is not None and count < 1:
         raise ValueError(f"benchmark_clips: count must be at least 1, got {count}; leave it out for all clips")
-    path = FOLDER / f"{split}.npz"
+    path = split_file(split)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tapip3d_lite" / "benchmark"
     key = _key(path)
     jobs = [
@@ -104,7 +121,8 @@ def _cached(job: Job) -> Clip | None:
 def _render(job: Job) -> None:
     """Render one clip into the cache."""
     path, name, rollout, marks = job
-    clip = replace(render_clip(rollout), name=name)
+    split, _, index = name.rpartition("-")
+    clip = replace(flawed(render_clip(rollout), split, int(index)), name=name)
     wrong = differences(clip, marks)
     if wrong:
         raise ValueError(

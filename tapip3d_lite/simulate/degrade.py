@@ -1,4 +1,4 @@
-"""Sensor-like depth and soft images: what a real camera does to a perfect clip; the true tracks stay true.
+"""Sensor-like depth, soft images and wrong poses: what reality does to a perfect clip; the true tracks stay true.
 
     z' = r_t z (1 + noise) + z^2 grain,  then steps of disparity, flying pixels and holes
 
@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.geometry import invert, transform
 from tapip3d_lite.validate import check_range
 
 _EDGE = 0.08  # neighbouring depths that differ by this share belong to two surfaces
@@ -83,7 +84,7 @@ def degrade(clip: Clip, config: SensorConfig, seed: int | np.random.Generator = 
     away = _grazing(clip, config.grazing) if config.grazing else None
     shape = depths.shape
     if config.flying:
-        near, far = cv2_each(cv2.erode, depths), cv2_each(cv2.dilate, depths)
+        near, far = _each(cv2.erode, depths), _each(cv2.dilate, depths)
         mixed = near + rng.random(shape, np.float32) * (far - near)
         depths = np.where(edge & (rng.random(shape) < config.flying) & (depths > 0) & (near > 0), mixed, depths)
     scale = np.exp(config.flicker * rng.standard_normal((len(depths), 1, 1)))
@@ -106,14 +107,45 @@ def degrade(clip: Clip, config: SensorConfig, seed: int | np.random.Generator = 
     return replace(clip, depths=depths, video=video)
 
 
-def cv2_each(change: object, depths: np.ndarray) -> np.ndarray:
+def wrong_poses(clip: Clip, degrees: float, seed: int | np.random.Generator = 0) -> Clip:
+    """The clip with `pose_error` in its cameras. What each camera sees stays; where that is in the world moves with it."""
+    extrinsics = clip.extrinsics.astype(np.float64)
+    error = pose_error(np.random.default_rng(seed), len(clip), degrees)
+    return move(clip, invert(error @ extrinsics) @ extrinsics)
+
+
+def pose_error(rng: np.random.Generator, frames: int, degrees: float) -> np.ndarray:
+    """Rigid errors (T, 4, 4) of cameras: in each frame one angle N(0, sigma) about a random axis (as the paper's), and drift."""
+    drift = np.cumsum(0.1 * np.radians(degrees) * rng.normal(size=(frames, 6)), 0)
+    axes = rng.normal(size=(frames, 3))
+    turns = axes / np.linalg.norm(axes, axis=-1, keepdims=True) * np.radians(degrees) * rng.normal(size=(frames, 1))
+    error = np.repeat(np.eye(4)[None], frames, 0)
+    error[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in turns + drift[:, :3]]
+    error[:, :3, 3] = drift[:, 3:]
+    return error
+
+
+def move(clip: Clip, motion: np.ndarray) -> Clip:
+    """Express a clip with tracks in other coordinates, by a rigid motion (T, 4, 4) float64.
+
+    A point at x in frame t is then at motion[t] x, and projects to the same pixel as before.
+    """
+    extrinsics = clip.extrinsics.astype(np.float64) @ invert(motion)
+    at = motion[clip.queries[:, 0].astype(int)]
+    places = transform(clip.queries[:, None, 1:].astype(np.float64), at)[:, 0]
+    queries = np.concatenate([clip.queries[:, :1], places], -1)
+    tracks = replace(clip.tracks, xyz=transform(clip.tracks.xyz.astype(np.float64), motion), queries=queries)
+    return replace(clip, extrinsics=extrinsics, tracks=tracks, queries=queries)
+
+
+def _each(change: object, depths: np.ndarray) -> np.ndarray:
     """A 3 x 3 operation of OpenCV on each frame."""
     return np.stack([change(frame, np.ones((3, 3), np.uint8)) for frame in depths])
 
 
 def _silhouettes(depths: np.ndarray) -> np.ndarray:
     """Pixels (T, H, W) whose neighbourhood holds two surfaces."""
-    near, far = cv2_each(cv2.erode, depths), cv2_each(cv2.dilate, depths)
+    near, far = _each(cv2.erode, depths), _each(cv2.dilate, depths)
     return (far - near) > _EDGE * np.maximum(near, 1e-3)
 
 

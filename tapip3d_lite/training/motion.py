@@ -8,13 +8,14 @@ all such motions, none included, works in either space. Ours also leaves a share
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.geometry import invert, transform
+from tapip3d_lite.geometry import invert
+from tapip3d_lite.simulate.degrade import move, pose_error
 from tapip3d_lite.validate import check_range
 
 
@@ -79,19 +80,6 @@ def smooth_motion(rng: np.random.Generator, frames: int, config: MotionConfig) -
     return np.stack(motion)
 
 
-def move(clip: Clip, motion: np.ndarray) -> Clip:
-    """Express a clip with tracks in other coordinates, by a rigid motion (T, 4, 4) float64.
-
-    A point at x in frame t is then at motion[t] x, and projects to the same pixel as before.
-    """
-    extrinsics = clip.extrinsics.astype(np.float64) @ invert(motion)
-    at = motion[clip.queries[:, 0].astype(int)]
-    places = transform(clip.queries[:, None, 1:].astype(np.float64), at)[:, 0]
-    queries = np.concatenate([clip.queries[:, :1], places], -1)
-    tracks = replace(clip.tracks, xyz=transform(clip.tracks.xyz.astype(np.float64), motion), queries=queries)
-    return replace(clip, extrinsics=extrinsics, tracks=tracks, queries=queries)
-
-
 def random_coordinates(clip: Clip, rng: np.random.Generator, config: MotionConfig) -> Clip:
     """Leave a clip in its world frame, rotate that frame, or move everything to the camera frame and then smoothly on.
 
@@ -113,17 +101,6 @@ def random_coordinates(clip: Clip, rng: np.random.Generator, config: MotionConfi
     if rng.random() < config.sliding:
         motion = slide(rng, frames, _log_uniform(rng, config.slide)) @ motion
     return move(clip, np.broadcast_to(motion, (frames, 4, 4)))
-
-
-def pose_error(rng: np.random.Generator, frames: int, degrees: float) -> np.ndarray:
-    """Rigid errors (T, 4, 4) of cameras: in each frame one angle N(0, sigma) about a random axis (as the paper's), and drift."""
-    drift = np.cumsum(0.1 * np.radians(degrees) * rng.normal(size=(frames, 6)), 0)
-    axes = rng.normal(size=(frames, 3))
-    turns = axes / np.linalg.norm(axes, axis=-1, keepdims=True) * np.radians(degrees) * rng.normal(size=(frames, 1))
-    error = np.repeat(np.eye(4)[None], frames, 0)
-    error[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in turns + drift[:, :3]]
-    error[:, :3, 3] = drift[:, 3:]
-    return error
 
 
 def slide(rng: np.random.Generator, frames: int, speed: float) -> np.ndarray:

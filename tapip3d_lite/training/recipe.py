@@ -127,7 +127,10 @@ class TrainConfig:
             "evaluate_every": 5000,
             "save_every": 1000,
             "loss": LossConfig(form="paper", visibility=3.0),
-            "motion": MotionConfig(world=0.0, turned=0.0, still=0.0, rotation=0.1, rotation_noise=0.05),
+            "motion": MotionConfig(
+                world=0.0, turned=0.0, still=0.0, rotation=0.1, rotation_noise=0.05, sliding=0.0, wrong=0.0
+            ),
+            "sensor": 0.0,
             "sampling": SamplingConfig(tracks=384),
         }
         return cls(**({"preset": preset} | (paper if preset == "paper" else {}) | changes))
