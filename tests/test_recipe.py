@@ -23,11 +23,12 @@ from tests.tiny import SIZES, checkpoint, recipe
 PAPER = {
     "clips": 10_000, "steps": 200_000, "batch": 1, "frames": (24, 24), "iterations": (4, 4), "short": 0.0,
     "train_encoder": True, "augment": True, "lr": 5e-4, "weight_decay": 5e-4, "warmup": 0.05, "clip_norm": 10.0,
-    "precision": "bfloat16", "minutes": None, "init": None,
+    "precision": "bfloat16", "minutes": None, "init": None, "sensor": 0.0,
     "loss": {"form": "paper", "visibility": 3.0, "discount": 0.8, "scale": 0.005, "soften": 0.0, "within": 0.0},
     "motion": {
         "world": 0.0, "turned": 0.0, "still": 0.0, "velocity": 0.03, "velocity_noise": 0.015, "rotation": 0.1,
-        "rotation_noise": 0.05, "smoothing": 0.8,
+        "rotation_noise": 0.05, "smoothing": 0.8, "sliding": 0.0, "slide": (0.002, 0.2), "wrong": 0.0,
+        "pose_noise": (0.05, 2.5),
     },
     "sampling": {"tracks": 384, "seen": 0.2, "anywhere": 0.25, "backward": 0.5},
     "augmentation": {
