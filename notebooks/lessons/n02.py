@@ -10,7 +10,7 @@ from lessons.checker import check
 from lessons.guesses import reveal
 from lessons.milestone import milestone
 from lessons.n02_exercises import EXERCISES
-from lessons.n02_straightness import SPACES, bend, fit_windows, stays_in_view, to_space
+from lessons.n02_straightness import SPACES, bend, fit_windows, rotations, stays_in_view, to_space
 from lessons.pictures import pipeline, show
 from lessons.progress import collect, in_use, progress, reset
 from lessons.widgets import explore
@@ -33,6 +33,7 @@ __all__ = [
     "progress",
     "reset",
     "reveal",
+    "rotations",
     "show",
     "stays_in_view",
     "to_space",
