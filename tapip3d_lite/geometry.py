@@ -16,10 +16,6 @@ import numpy as np
 import torch
 
 Array = np.ndarray | torch.Tensor
-# Both benchmarks measure pixels on an image of this size, and at these thresholds.
-RASTER = 256
-THRESHOLDS = (1, 2, 4, 8, 16)
-
 RASTER = 256  # pixels of the shorter side of the image on which the benchmarks measure errors
 THRESHOLDS = (1, 2, 4, 8, 16)  # errors in these pixels below which a point counts as found
 
