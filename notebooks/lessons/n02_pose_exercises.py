@@ -209,14 +209,14 @@ DRIFT = Exercise(
 # Signs of world - camera along the noise: one crossing, several, none, above from the start, and a touch before it.
 _PATTERNS = {
     1: ([-1, 1], [-1, -1, 1]),
-    2: ([-1, 1, -1, 1], [-1, 1, 1, -1, -1]),
-    3: ([-1, -1, -1], [1, 1, -1, 1]),
+    2: ([1, -1, 1], [-1, 1, 1, -1, -1], [-1, 1, -1, 1]),
+    3: ([-1, -1, -1], [1, 1, -1, 1], [-1, -1, 1, 1]),
     4: ([-1, 0, -1, -1, 1], [0, 0, 1, 1, -1], [-1, -1, 0, 1, -1, 1]),
 }
 
 
 def _curves(rng: np.random.Generator, size: int) -> tuple[Array, Array, Array]:
-    pattern = np.array(_PATTERNS[size][rng.integers(len(_PATTERNS[size]))])
+    pattern = np.array(_PATTERNS[size][int(rng.random() * len(_PATTERNS[size]))])
     camera = rng.uniform(1, 3, len(pattern))
     sigma = rng.choice([-0.0, 0.2]) + np.cumsum(rng.uniform(0.1, 1, len(pattern)) ** 2)
     return sigma, camera + pattern * rng.uniform(0.1, 1, len(pattern)), camera
