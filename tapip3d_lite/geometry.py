@@ -90,6 +90,12 @@ def project(points: Array, intrinsics: Array, extrinsics: Array | None = None) -
     return homogeneous[..., :2] / xp.clip(z, 1e-6, None)[..., None], z
 
 
+def in_image(points: Array, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> Array:
+    """Whether points (..., N, 3) lie before the camera and project into an image (H, W): (..., N) bool."""
+    uv, z = project(points, intrinsics, extrinsics)
+    return (z > 0) & (uv > -0.5).all(-1) & (uv[..., 0] < size[1] - 0.5) & (uv[..., 1] < size[0] - 0.5)
+
+
 def point_map(depths: Array, intrinsics: Array, extrinsics: Array | None = None) -> Array:
     """Lift whole depth maps to organised point maps.
 

@@ -59,18 +59,18 @@ def test_windows_overlap_by_half(frames, ends):
     assert list(window_ends(frames, 8)) == ends
 
 
-def test_short_clips_have_no_window_and_return_the_query(golden):
-    queries = golden.queries[:, golden.queries[0, :, 0] < 4]
-    xyz, logits = run(golden, golden.frames.cut(0, 4), queries)
-    assert torch.equal(xyz, queries[:, None, :, 1:].expand_as(xyz))
-    assert not logits.any()
-    moved, _ = run(golden, golden.frames.cut(0, 6), queries)
-    assert not torch.equal(moved, queries[:, None, :, 1:].expand_as(moved))
+@pytest.mark.parametrize("count", [1, 2, 4, 6, 8])
+def test_clips_shorter_than_a_window_are_tracked_like_padded_ones(golden, count):
+    queries = golden.queries[:, golden.queries[0, :, 0] < count]
+    xyz, logits = run(golden, golden.frames.cut(0, count), queries)
+    assert not torch.equal(xyz, queries[:, None, :, 1:].expand_as(xyz)) and logits.all()
+    padded, _ = run(golden, golden.frames.cut(0, count).pad(8), queries)
+    assert torch.equal(padded[:, :count], xyz)
 
 
 def test_padding_repeats_the_last_frame(golden):
     xyz, _ = run(golden)
-    longer, _ = run(golden, golden.frames.pad(4))
+    longer, _ = run(golden, golden.frames.pad(len(golden.frames) + 2))
     assert torch.equal(longer[:, : xyz.shape[1]], xyz)
 
 

@@ -66,9 +66,9 @@ class Frames:
         """The same frames backward in time."""
         return self._map(lambda x: x.flip(1))
 
-    def pad(self, multiple: int) -> Frames:
-        """Repeat the last frame until the number of frames is a multiple; the repeats count like any frame."""
-        extra = -len(self) % multiple
+    def pad(self, count: int) -> Frames:
+        """Repeat the last frame until there are so many; the repeats count like any frame."""
+        extra = count - len(self)
         return self if extra == 0 else self._map(lambda x: torch.cat([x, x[:, -1:].expand(-1, extra, *x.shape[2:])], 1))
 
     def to(self, device: torch.device | str) -> Frames:

@@ -1,7 +1,7 @@
 """Tracking one clip as a user wants it: any image size, both directions in time, helped by a grid of other points.
 
     forward pass  from t = 0 on;  backward pass on the reversed clip, for the frames before each query
-    visible       sigmoid(v) >= threshold
+    visible       sigmoid(v) >= threshold, inside the image, and not before the query without a backward pass
 
 Paper: section 4 (protocol: a grid of support queries, a second pass backward in time); the region of interest of depth
 is the released code's.
@@ -19,8 +19,10 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
+from tapip3d_lite.model.windows import padded, window_ends
 from tapip3d_lite.queries import grid_queries, resolve_queries
 
 _KEPT = 2**27  # floats of features kept for a whole clip (512 MiB); of longer clips only a window's are
@@ -56,7 +58,7 @@ def track(
         bidirectional: also track backward from queries after the first frame; otherwise frames before a query hold
             whatever the first window that contains it says.
         depth_roi: depths (near, far) that count for the scale; `"auto"`: up to q75 + 1.5 IQR of the clip; None: all.
-        visible_threshold: a point counts as visible from this probability on; the config's if None.
+        visible_threshold: a point inside the image is visible from this probability on; the config's if None.
         progress: show a bar.
 
     Returns:
@@ -83,7 +85,9 @@ def track(
             before = np.arange(len(clip))[:, None] < queries[:, 0]  # (T, N)
             xyz = np.where(before[..., None], other[0][::-1], xyz)
             logits = np.where(before, other[1][::-1], logits)
-    visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= threshold
+    asked = bidirectional | (np.arange(len(clip))[:, None] >= queries[:, 0])  # (T, N)
+    visible = asked & (1 / (1 + np.exp(-logits.astype(np.float64))) >= threshold)
+    visible &= in_image(xyz, clip.intrinsics, clip.extrinsics, clip.size)
     return Tracks(xyz, visible, queries, logits)
 
 
@@ -134,8 +138,7 @@ def _flip_time(rows: np.ndarray, frames: int) -> np.ndarray:
 def _bar(show: bool, tracker: nn.Module, frames: int, iterations: int | None, passes: int) -> Any:
     from tqdm.auto import tqdm
 
-    half = tracker.config.window // 2
-    windows = max(0, -(-frames // half) - 1)
+    windows = len(window_ends(padded(frames, tracker.config.window), tracker.config.window))
     total = windows * (iterations or tracker.config.iterations) * passes
     return tqdm(total=total, disable=not show, desc="tracking")
 
