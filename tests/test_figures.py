@@ -4,6 +4,7 @@ import base64
 import io
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,7 +120,98 @@ def test_cloud_codes_stand_for_the_pixels_colours(clip):
     assert np.abs(drawn - clip.video[2, v, u]).max() <= 255 / 12
 
 
-def test_scene_opens_behind_the_first_camera(clip):
+def opening(scene):
+    """How a plotly scene opens: points (P, 3) to places in the image, whose upper and lower borders are -1 and 1."""
+    ranges = np.array([scene[f"{k}axis"].range for k in "xyz"])
+    scale = np.array([scene.aspectratio[k] for k in "xyz"]) / np.ptp(ranges, axis=1)
+    up, eye, center = (np.array([scene.camera[name][k] for k in "xyz"]) for name in ("up", "eye", "center"))
+    ahead = (center - eye) / np.linalg.norm(center - eye)
+    right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
+
+    def places(xyz):
+        local = ((xyz - ranges.mean(1)) * scale - eye) @ np.stack([right, np.cross(right, ahead), ahead]).T
+        assert (local[:, 2] > 0).all()
+        return local[:, :2] / local[:, 2:] / np.tan(np.pi / 8)
+
+    return places, ranges, ahead
+
+
+SAMPLES = sorted((Path(__file__).parents[1] / "data_samples").glob("*.npz"))
+
+
+def as_from_a_sensor(clip):
+    """Noise, spikes, holes and a frame without depth; a world that is not level; no truth."""
+    rng = np.random.default_rng(0)
+    depths = clip.depths * rng.normal(1, 0.03, clip.depths.shape)
+    depths *= np.where(rng.random(depths.shape) < 0.001, rng.uniform(0.1, 10, depths.shape), 1)
+    depths *= rng.random(depths.shape) > 0.2
+    depths[3] = 0
+    tilt = t3d.geometry.look_at(np.array([3.0, -2, 5]), np.array([0.0, 1, 0]), np.array([0.3, 0.2, 1]))
+    tracks = replace(clip.tracks, xyz=t3d.geometry.transform(clip.tracks.xyz, tilt), dynamic=None)
+    queries = np.c_[clip.queries[:, :1], t3d.geometry.transform(clip.queries[:, 1:], tilt)]
+    tracks = replace(tracks, queries=queries)
+    poses = clip.extrinsics @ t3d.geometry.invert(tilt)
+    return replace(clip, depths=depths, extrinsics=poses, queries=queries, tracks=tracks)
+
+
+@pytest.mark.parametrize("path", [*SAMPLES, "sensor"], ids=lambda p: Path(p).stem)
+def test_scene_opens_on_all_that_is_drawn_in_any_frame(path):
+    shown = as_from_a_sensor(t3d.load_clip(SAMPLES[0])) if path == "sensor" else t3d.load_clip(path)
+    figure = t3d.figures.tracks_3d(shown, shown.tracks, points=600)
+    places, ranges, ahead = opening(figure.layout.scene)
+    clouds, _, heads = (
+        np.concatenate([np.stack([frame.data[i][k] for k in "xyz"], -1) for frame in figure.frames]) for i in range(3)
+    )
+    assert len(clouds) > 0.99 * 600 * (shown.depths.any((1, 2))).sum() and np.isfinite(heads).all()
+    for xyz in (clouds, heads):
+        assert ((xyz > ranges[:, 0]) & (xyz < ranges[:, 1])).all()  # else plotly would cut it off
+        assert (np.abs(places(xyz)) <= [1.6 * 0.9301, 0.9301]).all()
+    assert (np.abs(places(np.concatenate([clouds, heads]))) / [1.6, 1]).max() > 0.92  # and as near as that allows
+    assert ahead @ shown.extrinsics[0, 2, :3] > 0.8  # from behind the first camera
+
+
+def test_moving_bodies_are_whole_in_the_scene(clip):
+    far = clip.depths.copy()
+    seen = clip.tracks.visible & clip.tracks.dynamic
+    limit = t3d.geometry.transform(clip.tracks.xyz, clip.extrinsics)[..., 2][seen].max()
+    far[far > limit] *= 0.5  # more than half of the pixels are now far nearer than the farthest body
+    figure = t3d.figures.tracks_3d(replace(clip, depths=far), clip.tracks, points=10**6)
+    cloud = np.stack([figure.frames[0].data[0][k] for k in "xyz"], -1)
+    uv, _ = t3d.geometry.project(cloud, clip.intrinsics[0], clip.extrinsics[0])
+    drawn = np.zeros(clip.size, bool)
+    drawn[tuple(np.rint(uv).astype(int).T[::-1])] = True
+    assert drawn[(far[0] > 0) & (far[0] <= limit)].mean() > 0.99
+
+
+def test_a_track_that_went_astray_does_not_shrink_the_scene(clip):
+    xyz = clip.tracks.xyz.copy()
+    xyz[-1, 0], xyz[-1, 1] = 1e4, np.nan
+    lost = replace(clip.tracks, xyz=xyz)
+    plain = opening(t3d.figures.tracks_3d(clip, clip.tracks, points=300, max_tracks=1000).layout.scene)[1]
+    wild = opening(t3d.figures.tracks_3d(clip, lost, points=300, max_tracks=1000).layout.scene)[1]
+    assert (np.ptp(wild, axis=1) <= 1.01 * np.ptp(plain, axis=1)).all()
+
+
+def test_the_twin_is_the_scenes_opening_view(clip):
+    figure = t3d.figures.tracks_3d(clip, clip.tracks, points=4000)
+    places, _, _ = opening(figure.layout.scene)
+    twin = t3d.figures.tracks_3d_static(clip, clip.tracks, frames=[0, 3])
+    for ax, t in zip(twin.axes, (0, 3), strict=True):
+        cloud, heads = (places(np.stack([figure.frames[t].data[i][k] for k in "xyz"], -1)) for i in (0, 2))
+        drawn, marks = (np.asarray(c.get_offsets()) / np.tan(np.pi / 8) for c in ax.collections)
+        np.testing.assert_allclose(marks, heads, atol=2e-4)
+        np.testing.assert_allclose(np.sort(drawn, axis=0), np.sort(cloud, axis=0), atol=2e-4)
+        assert np.abs(marks).max(0)[1] < ax.get_ylim()[1] / np.tan(np.pi / 8)
+
+
+def test_the_scene_says_what_its_colours_and_axes_mean(clip):
+    layout = t3d.figures.tracks_3d(clip, clip.tracks, points=100, tail=5).layout
+    assert all(word in layout.title.text for word in ("Colour of a track", "Hollow: hidden", "5 frames", "scene units"))
+    assert [layout.scene[f"{k}axis"].title.text for k in "xyz"] == [f"{k}, world (scene units)" for k in "xyz"]
+    assert "scene unit" in t3d.figures.tracks_3d_static(clip, clip.tracks).axes[0].get_title()
+
+
+def test_scene_stands_upright_in_world_and_camera_coordinates(clip):
     back = t3d.geometry.invert(clip.extrinsics[0])
     local = t3d.geometry.transform(clip.tracks.xyz, clip.extrinsics[0])
     queries = t3d.geometry.transform(clip.queries[:, 1:], clip.extrinsics[0])
@@ -189,7 +281,7 @@ def test_explorer_redraws_with_the_values_of_its_controls():
     frame, space, _ = box.children[0].children
     space.value = "camera"
     _, picture, refusal = box.children
-    assert bytes(picture.value).startswith(b"\x89PNG") and picture.layout.display is None
+    assert '<img alt="The figure above. Shown with frame 4' in picture.value and picture.layout.display is None
     frame.value = 9
     assert calls == [(4, "world", 0.5), (4, "camera", 0.5), (9, "camera", 0.5)]
     assert refusal.value == "no such frame" and picture.layout.display == "none"

@@ -25,8 +25,8 @@ DIMS = {
     "T_": 12,
     "S": 4,
     "N": 23,
-    "n": 6,
-    "n_t": 17,
+    "N_": 6,
+    "N_t": 17,
     "K": 3,
     "L": 2,
     "H": 40,
@@ -34,7 +34,7 @@ DIMS = {
     "h": 10,
     "w": 16,
 }
-DIMS |= {"C": 20, "D": 22, "A": 7, "A_dim": 13, "U": 18, "V": 15, "G": 1 + 2 * 22 + 8 * 33}
+DIMS |= {"C": 20, "D": 22, "A": 7, "d": 13, "U": 18, "V": 15, "G": 1 + 2 * 22 + 8 * 33}
 CONFIG = t3d.TrackerConfig(
     image_size=(40, 64), window=4, neighbors=3, levels=2, feature_dim=20, token_dim=22, context_heads=7,
     context_head_dim=13, offset_dim=14, virtual_tracks=15, hidden=18, heads=3, head_dim=6, iterations=2, mlp_ratio=1.0,
@@ -121,7 +121,7 @@ def test_every_shape_is_that_of_a_running_tracker():
     assert not [f.name for f in wanted if f.name not in confirmed]
 
 
-@pytest.mark.parametrize("wrong", ["(3, N)", "(2, n, 3)", "(N, 3, 2)", "(2, N, 3, 1)"])
+@pytest.mark.parametrize("wrong", ["(3, N)", "(2, N', 3)", "(N, 3, 2)", "(2, N, 3, 1)"])
 def test_a_wrong_shape_is_noticed(wrong):
     right = Formula("", "x", "x", "geometry.transform", "return points @", (Symbol("x", "points", "(2, N, 3)"),))
 

@@ -10,6 +10,7 @@ from importlib import import_module
 import pytest
 from PIL import Image
 
+from lessons.formulas import formulas
 from lessons.teaching import minutes, model_answers, question_of, read_notebook, solution_copy, tags, tasks
 from tests.mutants import KNOWN, known, mutants, survivors
 from tests.notebook_tools import FOLDER, notebooks
@@ -60,7 +61,7 @@ def table_rows(text):
 def atoms(cell):
     """The symbols of a table's first cell without indices and primes, e.g. `$F^l_t$` -> {"F"}."""
     formulas = " ".join(re.findall(r"\$([^$]*)\$", cell))
-    formulas = re.sub(r"\\text\{[^}]*\}|[\^_](?:\{[^{}]*(?:\{[^{}]*\}[^{}]*)*\}|\\?\w|\*)", "", formulas)
+    formulas = re.sub(r"\\text\{[^}]*\}|[\^_](?:\{[^{}]*(?:\{[^{}]*\}[^{}]*)*\}|\\\w+|\w|\*)", "", formulas)
     found = {"".join(part) for part in _SYMBOL.findall(formulas)}
     return found - {"lVert", "rVert", "sqrt", "frac", "cdot", "to", "mathbf", "mathrm", "mathcal", "hat", "bar", "ge"}
 
@@ -81,6 +82,50 @@ def test_a_symbol_means_the_same_in_all_lessons(path):
                 wanted = SYMBOLS[min(atoms(cells[0]))]
                 meaning = cells[1].lower()
                 assert any(word[:6].lower() in meaning for word in wanted), f"{cells[0]}: {meaning}; {wanted}"
+
+
+_INDEX = re.compile(
+    r"_(?:\{[^{}]*(?:\{[^{}]*\}[^{}]*)*\}|\\text\{[^}]*\}|\\\w+|\w)|\^(?!\*)(?:\{[^{}]*\}|\\\w+|\w)|\\bar|\\text\{[^}]*\}"
+)
+_LETTER = re.compile(r"\\(?:mathbf|mathrm|mathcal)\{\w+\}(?:\^\*)?|\\hat ?\w|[A-Za-z]\^\*|\\[A-Za-z]+|[A-Za-z]")
+_NAMED = re.compile(r"([fc]_[xy]|t_q|W_\\text\{\w\}|\\mathrm\{hit\}_k)")  # with these indices letters of their own
+_OPERATIONS = (
+    r"\sin \cos \log \min \arg \sqrt \frac \tfrac \sum \partial \lfloor \rfloor \lVert \rVert \overline \left \right"
+)
+_OPERATIONS += r" \cup \in \times \wedge \ge \cdot \dots \leftarrow \mathrel \quad \top"
+
+
+def letters(formula):
+    """The letters of a formula, bold, script, hat and star included, without indices and operations."""
+    named = set(_NAMED.findall(formula))
+    rest = _INDEX.sub("", _NAMED.sub("", formula))
+    return named | set(_LETTER.findall(rest)) - set(_OPERATIONS.split())
+
+
+ALPHABET = [
+    (letter, cells)
+    for cells in table_rows((FOLDER / "SYMBOLS.md").read_text(encoding="utf-8"))
+    for letter in letters(" ".join(re.findall(r"\$([^$]*)\$", cells[0])))
+]
+
+
+def test_no_letter_has_two_meanings():
+    found = [letter for letter, _ in ALPHABET]
+    assert len(found) > 60 and sorted(set(found)) == sorted(found)
+
+
+def test_the_table_of_formulas_speaks_the_same_language():
+    known_letters = {letter for letter, _ in ALPHABET}
+    named = {}  # what the code calls a letter
+    for letter, cells in ALPHABET:
+        for name in re.findall(r"`(\w+)`", cells[3].split(";")[0]):
+            named.setdefault(name, set()).add(letter)
+    for formula in formulas():
+        for written in (formula.latex, *(symbol.written for symbol in formula.symbols)):
+            assert letters(written) <= known_letters, f"{formula.name}: {letters(written) - known_letters} in {written}"
+        for symbol in formula.symbols:
+            wanted = named.get(symbol.tensor.split(".")[-1])
+            assert not wanted or wanted & letters(symbol.written), f"{formula.name}: {symbol} is called {wanted}"
 
 
 @each_notebook

@@ -26,10 +26,12 @@ _HEAD = """# From formula to line of code
 Every equation of the method, the tensor that holds each of its symbols, its shape, and the line where it happens.
 Written by `python3 run.py formulas`; the tests compare it with the code and its shapes with a running tracker.
 
-B clips, T frames (T' padded to whole half windows), S frames of a window, N tracks, n of them in a window,
-n_t queried in one frame, K neighbours, L levels, M iterations, H x W pixels, h x w cells of the finest level, h_l x w_l
-of level l, C feature channels, D width of a neighbourhood token, A heads of A_dim channels in it, G width of the
-trajectory token, U width of the updater, V virtual tracks.
+The letters are those of [SYMBOLS.md](SYMBOLS.md), the same as in the lessons. In shapes: B clips, T frames (T' padded to
+whole half windows), S frames of a window, N tracks, N' of them in a window (n in the code's comments), N_t queried in
+one frame, K neighbours, L levels, M updates, H x W pixels, h x w cells of the finest level, h_l x w_l of level l, C
+feature channels, D width of a neighbourhood token, A heads, each d wide, G width of the trajectory token, U width of
+the updater, V virtual tracks. Words in formulas are functions and settings of the code: Cross and Self are blocks of
+attention and MLP in which tokens look at others, or at themselves; an arrow overwrites; a bar is a mean.
 
 Sections, and equations (1) to (4), are those of the paper; N2N attention has no numbered equation there. Where the paper
 and the released code differ, this kit computes what the released code does:
@@ -151,12 +153,20 @@ def formula_table(link: str = "../") -> str:
         file = Path(inspect.getsourcefile(formula.code())).resolve().relative_to(root).as_posix()
         line = formula.line()
         where = f"[{file}:{line}]({link}{file}#L{line})"
-        lines.append(f"| **{formula.name}** | ${formula.latex}$ | `{formula.function}` | | {where} |")
+        lines.append(f"| **{formula.name}** | {_math(formula.latex)} | `{formula.function}` | | {where} |")
         for symbol in formula.symbols:
             line = formula.line_of(symbol)
             where = f"[:{line}]({link}{file}#L{line})"
-            lines.append(f"| | ${symbol.written}$ | `{symbol.tensor}` | `{symbol.shape}` | {where} |")
+            lines.append(f"| | {_math(symbol.written)} | `{symbol.tensor}` | `{symbol.shape}` | {where} |")
     return "\n".join(lines) + "\n"
+
+
+def _math(latex: str) -> str:
+    """A formula that Markdown leaves alone: GitHub drops the backslash before a sign, and pairs stars."""
+    safe = {r"\,": r"\thinspace ", r"\ ": "~", r"\{": r"\lbrace ", r"\}": r"\rbrace ", "^*": r"^\ast"}
+    for written, shown in safe.items():
+        latex = latex.replace(written, shown)
+    return f"${latex}$"
 
 
 def _expressions(lines: list[str]) -> Iterator[tuple[int, str]]:

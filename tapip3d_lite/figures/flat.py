@@ -16,14 +16,18 @@ INK = "#30343b"
 STILL, MOVING = "#2b6cb0", "#d1495b"  # points at rest, points on moving bodies
 
 
+_PALETTE, _ENDS = matplotlib.colormaps["plasma"], (0.02, 0.93)  # its order is seen by the colour-blind, too
+PLACES = tuple(_PALETTE(end)[:3] for end in _ENDS)  # colours of tracks that begin top left and bottom right
+
+
 def track_colors(clip: Clip, tracks: Tracks) -> np.ndarray:
     """One RGB colour (N, 3) in [0, 1] for each track, by where its query lies in the image; alike in all figures."""
     t = tracks.queries[:, 0].astype(int)
     uv, _ = project(tracks.queries[:, None, 1:], clip.intrinsics[t], clip.extrinsics[t])
     height, width = clip.size
     place = (uv[:, 0, 0] / width + uv[:, 0, 1] / height) / 2
-    # Most queries lie around the middle of the image: the steeper slope spends the rainbow on them.
-    return matplotlib.colormaps["turbo"](np.clip(0.5 + 1.7 * (place - 0.5), 0.04, 0.96))[:, :3]
+    # Most queries lie around the middle of the image: the steeper slope spends the colours on them.
+    return _PALETTE(np.clip(0.5 + 1.7 * (place - 0.5), *_ENDS))[:, :3]
 
 
 def check_drawable(clip: Clip, tracks: Tracks | None = None, frame: int = 0) -> None:

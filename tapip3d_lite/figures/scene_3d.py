@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import plotly.graph_objects as go
+from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from tapip3d_lite.clip import Clip, Tracks
-from tapip3d_lite.figures.flat import check_drawable, track_colors
-from tapip3d_lite.geometry import invert, transform, unproject
+from tapip3d_lite.figures.flat import INK, PLACES, check_drawable, track_colors
+from tapip3d_lite.geometry import transform, unproject
 
 _LEVELS = 12  # colour levels per channel: a code into 1728 colours costs two bytes a point, an RGB string twenty
 _CHANNEL = (np.arange(_LEVELS) * 255 / (_LEVELS - 1)).round().astype(int)
+_SIGHT = float(np.tan(np.pi / 8))  # plotly's lens sees 45 degrees from top to bottom
+_HALF = 0.93 * _SIGHT  # within which all that is drawn lies in the opening view
+_WIDE = 1.6  # width by height of the narrowest scene in which it does
 _CLOUD_COLORS = [f"rgb({r},{g},{b})" for r in _CHANNEL for g in _CHANNEL for b in _CHANNEL]
 
 
@@ -24,7 +28,8 @@ def tracks_3d(
 ) -> go.Figure:
     """Point cloud and tracks in world coordinates with a time slider and a play button.
 
-    The view opens where the first camera stands and stays as the reader turns it while the slider moves.
+    The view opens from behind and above the first camera and shows all that is drawn in any frame; it stays as the
+    reader turns it while the slider moves.
 
     Args:
         clip: the clip.
@@ -35,19 +40,23 @@ def tracks_3d(
         title: above the scene.
     """
     check_drawable(clip, tracks)
-    clip, tracks = _foreground(clip, tracks, max_tracks)
+    clip, tracks, clouds, limits = _drawn(clip, tracks, points, max_tracks)
     colors = [to_hex(color) for color in track_colors(clip, tracks)]
-    parts = [_moving_parts(clip, tracks, t, points, tail) for t in range(len(clip))]
+    parts = [_moving_parts(cloud, tracks, t, tail) for t, cloud in enumerate(clouds)]
     # A frame carries only what changes; the rest stays with the traces and the colour axes of the layout.
     frames = [go.Frame(name=str(t), data=[go.Scatter3d(part) for part in now]) for t, now in enumerate(parts)]
     traces = [go.Scatter3d(part).update(style) for part, style in zip(parts[0], _styles(colors), strict=True)]
     layout = {
-        "title": {"text": title or clip.name, "font": {"size": 14}},
-        "scene": _scene(clip, tracks),
+        "title": {
+            "text": f"{title or clip.name} · world axes, scene units<br><sup>{_key(tail)}</sup>",
+            "font": {"size": 14},
+            "x": 0.02,
+        },
+        "scene": _scene(_View.of(clip, clouds, tracks), limits),
         "coloraxis": _color_axis(_CLOUD_COLORS),
         "coloraxis2": _color_axis(colors),
-        "margin": {"l": 0, "r": 0, "t": 34, "b": 0},
-        "height": 560,
+        "margin": {"l": 0, "r": 0, "t": 52, "b": 0},
+        "height": 600,
         "showlegend": False,
         "uirevision": "keep",  # the reader's view survives every redraw
     }
@@ -55,7 +64,7 @@ def tracks_3d(
 
 
 def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = None, points: int = 4000) -> Figure:
-    """The matplotlib twin of `tracks_3d`: the scene at a few instants, from above the first camera.
+    """The matplotlib twin of `tracks_3d`: its opening view at a few instants.
 
     Args:
         clip: the clip.
@@ -66,33 +75,115 @@ def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = 
     frames = [0, len(clip) // 2, len(clip) - 1] if frames is None else list(frames)
     for t in frames:
         check_drawable(clip, tracks, t)
-    clip, tracks = _foreground(clip, tracks, 120)
-    colors = track_colors(clip, tracks)
-    figure = Figure(figsize=(3.4 * len(frames), 2.6), layout="constrained")
-    upright = _upright(clip)
-    limits = axis_limits(transform(np.concatenate([_cloud_points(clip, t, 800)[0] for t in frames]), upright))
-    for i, t in enumerate(frames):
-        ax = figure.add_subplot(1, len(frames), i + 1, projection="3d", computed_zorder=False)
-        xyz, rgb = _cloud_points(clip, t, points)
-        ax.scatter(*transform(xyz, upright).T, c=rgb / 255, s=2.2, depthshade=False, linewidths=0)
-        path = transform(tracks.xyz[max(0, t - 12) : t + 1], upright)
+    clip, tracks, clouds, _ = _drawn(clip, tracks, points, 120)
+    colors, view = track_colors(clip, tracks), _View.of(clip, clouds, tracks)
+    figure = Figure(figsize=(3.4 * len(frames), 3.4 / _WIDE + 0.25), layout="constrained")
+    for ax, t in zip(figure.subplots(1, len(frames), squeeze=False)[0], frames, strict=True):
+        xyz, rgb = clouds[t]
+        flat, depth = view.project(xyz)
+        order = np.argsort(-depth)  # what is near covers what is far
+        ax.scatter(*flat[order].T, c=rgb[order] / 255, s=2.2, linewidths=0)
+        path = view.project(tracks.xyz[max(0, t - 12) : t + 1])[0]
         for n, color in enumerate(colors):
             ax.plot(*path[:, n].T, color=color, lw=1)
         faces = np.where(tracks.visible[t][:, None], colors, 1)
-        ax.scatter(*path[-1].T, s=9, facecolors=faces, edgecolors=colors, depthshade=False)
-        ax.set_box_aspect(np.ptp(limits, axis=-1), zoom=1.6)
-        ax.view_init(elev=32, azim=-75)
-        ax.set_title(f"t = {t}", fontsize=8)
-        ax.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], xticklabels=[], yticklabels=[], zticklabels=[])
+        ax.scatter(*path[-1].T, s=9, facecolors=faces, edgecolors=colors, linewidths=0.8, zorder=3)
+        ax.set_title(f"t = {t}", fontsize=9)
+        ax.set(aspect="equal", xticks=[], yticks=[], xlim=(-_WIDE * _SIGHT, _WIDE * _SIGHT), ylim=(-_SIGHT, _SIGHT))
+        ax.spines[:].set_color("#d5d8dd")
+    _draw_tripod(figure.axes[0], view)
     return figure
+
+
+@dataclass(frozen=True)
+class _View:
+    """Where a scene is looked at from: its eye (3,), what is up (3,), rows right, up and ahead (3, 3), how far its middle is."""
+
+    eye: np.ndarray
+    up: np.ndarray
+    axes: np.ndarray
+    distance: float
+
+    @classmethod
+    def of(cls, clip: Clip, clouds: Sequence[tuple], tracks: Tracks) -> _View:
+        """From behind and above the clip's first camera, as near as all that is drawn fits into the image."""
+        up = _up(clip)
+        ahead = clip.extrinsics[0, 2, :3] - 0.5 * up
+        right = np.cross(ahead, up)
+        axes = np.stack([right, np.cross(right, ahead), ahead]).astype(float)
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        xyz = np.concatenate([*(cloud for cloud, _ in clouds), tracks.xyz.reshape(-1, 3)])
+        local = xyz[np.isfinite(xyz).all(-1)] @ axes.T
+        # A point is seen where |x| <= a z and |y| <= b z from the eye: four planes, which the eye moves back to touch.
+        slopes = np.array([_WIDE, 1]) * _HALF
+        over = (local[:, :2] - slopes * local[:, 2:]).max(0)
+        under = (-local[:, :2] - slopes * local[:, 2:]).max(0)
+        eye = np.append((over - under) / 2, (-(over + under) / (2 * slopes)).min())
+        return cls(eye @ axes, up, axes, float(np.median(local[:, 2]) - eye[2]))
+
+    def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places (..., 2) in the image, whose upper and lower borders are +-`_HALF` and a margin, and depths (...)."""
+        local = (xyz - self.eye) @ self.axes.T
+        return local[..., :2] / local[..., 2:], local[..., 2]
+
+
+def _drawn(clip: Clip, tracks: Tracks, points: int, most: int) -> tuple:
+    """The foreground's clip and tracks, a cloud (xyz, rgb) for each frame, and limits (3, 2) that hold all of it.
+
+    Single far points of a cloud, and what a track that went astray does farther off than the scene is large, are left out.
+    """
+    clip, tracks = _foreground(clip, tracks, most)
+    clouds = [_cloud_points(clip, t, points) for t in range(len(clip))]
+    room = axis_limits(np.concatenate([xyz for xyz, _ in clouds]))
+    size = np.ptp(room, axis=-1).max()
+    astray = _outside(tracks.xyz, room + size * np.array([-1, 1]))
+    tracks = replace(tracks, xyz=np.where(astray[..., None], np.float32(np.nan), tracks.xyz))
+    inside = [~_outside(xyz, room) for xyz, _ in clouds]
+    clouds = [(xyz[kept], rgb[kept]) for (xyz, rgb), kept in zip(clouds, inside, strict=True)]
+    ends = np.concatenate([room.T, tracks.xyz.reshape(-1, 3)])
+    margin = 0.02 * size * np.array([-1, 1])
+    return clip, tracks, clouds, np.stack([np.nanmin(ends, axis=0), np.nanmax(ends, axis=0)], -1) + margin
+
+
+def _outside(xyz: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    return ~((xyz >= limits[:, 0]) & (xyz <= limits[:, 1])).all(-1)
+
+
+def _key(tail: int) -> str:
+    """What colours and marks mean, in one line of HTML."""
+    first, last = (f'<span style="color:{to_hex(color)}">■</span>' for color in PLACES)
+    return (
+        f"Colour of a track: where its query lies in the image, {first} top left to {last} bottom right. "
+        f"Hollow: hidden. Tail: its last {tail} frames."
+    )
+
+
+def _draw_tripod(ax: Axes, view: _View) -> None:
+    """World axes in a corner of a panel, as long as one (or ten, a tenth, …) scene units in the middle of the view."""
+    length = 10.0 ** np.floor(np.log10(0.6 * view.distance * _SIGHT))
+    middle = view.eye + view.distance * view.axes[2]
+    corner = np.array([-0.8 * _WIDE, -0.72]) * _SIGHT
+    for name, end in zip("xyz", view.project(middle + length * np.eye(3))[0], strict=True):
+        arrow = {"arrowstyle": "->", "color": INK, "shrinkA": 0, "shrinkB": 0}
+        ax.annotate("", corner + end, corner, arrowprops=arrow)
+        far = end * (1 + 0.07 * _SIGHT / max(np.linalg.norm(end), 0.02))
+        ax.text(*(corner + far), name, fontsize=8, color=INK, ha="center", va="center")
+    ax.set_title(
+        f"{ax.get_title()}  (arrows: world axes, {length:g} scene unit{'' if length == 1 else 's'})", fontsize=9
+    )
 
 
 def _foreground(clip: Clip, tracks: Tracks, most: int) -> tuple[Clip, Tracks]:
     """The clip without its far depths, which would shrink all that moves to a speck, and at most `most` tracks.
 
-    They are evenly picked from those whose query lies within the depths that are left.
+    They are evenly picked from those whose query lies within the depths that are left. No body that is known to move
+    is cut off, be it up to twice as far.
     """
     near = 1.6 * float(np.median(clip.depths[clip.depths > 0]))
+    truth = clip.tracks
+    if truth is not None and truth.dynamic is not None:
+        body = transform(truth.xyz, clip.extrinsics)[..., 2][truth.visible & truth.dynamic]
+        near = max(near, min(1.05 * float(body.max(initial=0)), 2 * near))
     t = tracks.queries[:, 0].astype(int)
     z = transform(tracks.queries[:, None, 1:], clip.extrinsics[t])[:, 0, 2]
     inside = np.flatnonzero(z <= near) if (z <= near).any() else np.arange(len(z))
@@ -109,9 +200,9 @@ def _cloud_points(clip: Clip, frame: int, points: int) -> tuple[np.ndarray, np.n
     return world, clip.video[frame, v, u]
 
 
-def _moving_parts(clip: Clip, tracks: Tracks, frame: int, points: int, tail: int) -> list[dict[str, object]]:
-    """What changes over time: of the cloud, the tails and the heads."""
-    cloud, rgb = _cloud_points(clip, frame, points)
+def _moving_parts(cloud: tuple, tracks: Tracks, frame: int, tail: int) -> list[dict[str, object]]:
+    """What changes over time: of the cloud (xyz, rgb), the tails and the heads."""
+    xyz, rgb = cloud
     code = (rgb.astype(int) * _LEVELS) // 256 @ [_LEVELS**2, _LEVELS, 1]
     path = tracks.xyz[max(0, frame - tail) : frame + 1]
     gap = np.full((1, path.shape[1], 3), np.nan, np.float32)  # NaN lifts the pen between tracks
@@ -119,7 +210,7 @@ def _moving_parts(clip: Clip, tracks: Tracks, frame: int, points: int, tail: int
     index = np.repeat(np.arange(path.shape[1], dtype=np.uint16), len(path) + 1)
     symbols = ["circle" if seen else "circle-open" for seen in tracks.visible[frame]]
     return [
-        _xyz(cloud.astype(np.float32)) | {"marker": {"color": code.astype(np.uint16)}},
+        _xyz(xyz.astype(np.float32)) | {"marker": {"color": code.astype(np.uint16)}},
         _xyz(tails) | {"line": {"color": index}},
         _xyz(tracks.xyz[frame]) | {"marker": {"symbol": symbols}},
     ]
@@ -147,9 +238,11 @@ def _color_axis(colors: list[str]) -> dict[str, object]:
 
 
 def axis_limits(xyz: np.ndarray) -> np.ndarray:
-    """Limits (3, 2) of the axes around points (P, 3), with a margin and without the few farthest; NaN is left out."""
+    """Limits (3, 2) around points (P, 3), with a margin; single points far from all others and NaN are left out."""
     low, high = np.nanquantile(xyz, [0.002, 0.998], axis=0)
-    return np.stack([low, high], -1) + 0.03 * (high - low).max() * np.array([-1, 1])
+    room = 0.25 * (high - low).max()
+    ends = np.maximum(np.nanmin(xyz, axis=0), low - room), np.minimum(np.nanmax(xyz, axis=0), high + room)
+    return np.stack(ends, -1) + 0.02 * room * np.array([-1, 1])
 
 
 def fixed_axes(limits: np.ndarray) -> dict[str, object]:
@@ -162,21 +255,16 @@ def fixed_axes(limits: np.ndarray) -> dict[str, object]:
     return axes | {"aspectmode": "manual", "aspectratio": _xyz(sizes / np.prod(sizes) ** (1 / 3))}
 
 
-def _scene(clip: Clip, tracks: Tracks) -> dict[str, object]:
-    """Axes with fixed ranges, seen from behind and above the clip's first camera."""
-    steps = np.linspace(0, len(clip) - 1, min(len(clip), 6)).astype(int)
-    cloud = np.concatenate([_cloud_points(clip, t, 800)[0] for t in steps])
-    ranges = axis_limits(np.concatenate([cloud, tracks.xyz[steps].reshape(-1, 3)]))
-    style = {"showspikes": False, "tickfont": {"size": 9}, "backgroundcolor": "#f4f5f7"}
-    scene = fixed_axes(ranges)
+def _scene(view: _View, limits: np.ndarray) -> dict[str, object]:
+    """Axes with fixed ranges, opened as the view says."""
+    style = {"showspikes": False, "tickfont": {"size": 10}, "backgroundcolor": "#f4f5f7"}
+    scene = fixed_axes(limits)
     for k in "xyz":
-        scene[f"{k}axis"] |= style | {"title": {"text": f"{k} (scene units)", "font": {"size": 10}}}
-    up, target = _up(clip), np.median(cloud, axis=0)
-    back = invert(clip.extrinsics[0])[:3, 3] - target
-    eye = target + 1.2 * back + 0.3 * np.linalg.norm(back) * up
+        scene[f"{k}axis"] |= style | {"title": {"text": f"{k}, world (scene units)", "font": {"size": 11}}}
     # The camera's unit is the geometric mean of the three ranges, counted from their middle.
-    unit, middle = np.prod(np.ptp(ranges, axis=-1)) ** (1 / 3), ranges.mean(-1)
-    camera = {"up": up, "eye": (eye - middle) / unit, "center": (target - middle) / unit}
+    unit, middle = np.prod(np.ptp(limits, axis=-1)) ** (1 / 3), limits.mean(-1)
+    center = view.eye + view.distance * view.axes[2]
+    camera = {"up": view.up, "eye": (view.eye - middle) / unit, "center": (center - middle) / unit}
     return scene | {"camera": {name: _xyz(vector) for name, vector in camera.items()}}
 
 
@@ -185,15 +273,6 @@ def _up(clip: Clip) -> np.ndarray:
     right, up = clip.extrinsics[:, 0, 2], -clip.extrinsics[:, 1, 2]
     level = np.abs(right).mean() < 0.15 and up.min() > 0.15
     return np.array([0.0, 0.0, 1.0]) if level else -clip.extrinsics[0, 1, :3].astype(float)
-
-
-def _upright(clip: Clip) -> np.ndarray:
-    """A motion (4, 4) from the world to axes right, ahead and up as the first camera sees them, without its pitch."""
-    up, pose = _up(clip), np.eye(4)
-    right = clip.extrinsics[0, 0, :3] - (clip.extrinsics[0, 0, :3] @ up) * up
-    right = right / np.linalg.norm(right)
-    pose[:3, :3] = np.stack([right, np.cross(up, right), up])
-    return pose
 
 
 def animation_args(duration: int) -> dict[str, object]:
