@@ -7,6 +7,7 @@ real `lite` from nothing, its encoder trained along, 128 x 128 pixels, in bfloat
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -85,12 +86,13 @@ class Setting:
         """A trainer that begins anew.
 
         Args:
-            folder: of the training.
+            folder: of the training; what an earlier one left there is deleted.
             paths: training clips.
             watched: held-out clips that it is scored on now and then.
             loss: another one than the recipe's.
             minutes: another time than the recipe's.
         """
+        shutil.rmtree(folder, ignore_errors=True)
         if self.recipe.precision == "bfloat16":
             torch.set_float32_matmul_precision("high")  # TF32, for what is left in float32
         recipe = replace(
