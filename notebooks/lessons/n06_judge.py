@@ -106,6 +106,7 @@ def controls_figure(found: Mapping[str, Mapping[str, Ratio]]) -> Figure:
     """
     figure = Figure(figsize=(4.6 * len(found), 2.9), layout="constrained")
     axes = figure.subplots(1, len(found), squeeze=False, sharey=True, sharex=True)[0]
+    most = max(1.25, *(1.05 * value.high for films in found.values() for value in films.values()))
     for ax, (tracker, films) in zip(axes, found.items(), strict=True):
         for row, value in enumerate(films.values()):
             color, mark = COLORS[1 + row % 5], MARKS[row % len(MARKS)]
@@ -116,7 +117,7 @@ def controls_figure(found: Mapping[str, Mapping[str, Ratio]]) -> Figure:
             )
         ax.axvline(1, color=COLORS[0], ls="--", lw=1)
         ax.set_yticks(range(len(films)), list(films))
-        ax.set(xlim=(0, 1.25), ylim=(len(films) - 0.5, -0.7), title=tracker, xlabel="error over that of zero motion")
+        ax.set(xlim=(0, most), ylim=(len(films) - 0.5, -0.7), title=tracker, xlabel="error over that of zero motion")
         ax.spines[["top", "right"]].set_visible(False)
     return figure
 
