@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from unittest import mock
 
@@ -22,6 +24,7 @@ import tapip3d_lite as t3d
 from lessons import progress
 from lessons.verdict import Verdict
 from tapip3d_lite.model.frames import Frames, frames_from_clip
+from tapip3d_lite.model.registry import make_module
 
 Use = Callable[[str], Callable[..., object]]
 CLIP = Path(__file__).parents[2] / "data_samples" / "handheld.npz"
@@ -29,17 +32,21 @@ _FRAMES, _POINTS = 16, 16  # one window
 _METRES = 1e-3
 
 
-def milestone(*lessons: str, spaces: tuple[str | None, ...] = (None,)) -> Verdict:
+def milestone(
+    *lessons: str, spaces: tuple[str | None, ...] = (None,), neighborhoods: tuple[str | None, ...] = (None,)
+) -> Verdict:
     """Track a clip with the learner's functions of some lessons, e.g. `milestone("03")`, and compare with the library.
 
-    `spaces` are those to track in, None for the tracker's own.
+    `spaces` are those to track in and `neighborhoods` the kinds to track with, None for the tracker's own.
     Passed: each function is the learner's, the tracker called each, and no point is off by a millimetre.
     """
     calls: dict[str, int] = {}
     with plugged(lessons, calls):
-        mine = [_tracks(space) for space in spaces]
-    apart = max(float(np.abs(xyz - _library(space)).max()) for xyz, space in zip(mine, spaces, strict=True))
-    where = f", in the spaces {', '.join(map(str, spaces))}" if spaces != (None,) else ""
+        mine = {way: _tracks(*way) for way in product(spaces, neighborhoods)}
+    apart = max(float(np.abs(xyz - _library(*way)).max()) for way, xyz in mine.items())
+    where = f", in the spaces {', '.join(map(str, spaces))}" if len(spaces) > 1 else f", in {spaces[0]} coordinates"
+    where = where if spaces != (None,) else ""
+    where += f", with the neighbourhoods {', '.join(map(str, neighborhoods))}" if neighborhoods != (None,) else ""
     lines = [f"{len(calls)} functions in the tracker; tracks of {_POINTS} points over {_FRAMES} frames{where}"]
     for name, count in calls.items():
         whose = "yours" if progress.is_yours(name) else "the reference, until yours passes"
@@ -105,8 +112,11 @@ def frames_and_queries() -> tuple[Frames, torch.Tensor]:
     return Frames(rgb, depths, intrinsics, poses), queries
 
 
-def _tracks(space: str | None = None) -> np.ndarray:
+def _tracks(space: str | None = None, neighborhood: str | None = None) -> np.ndarray:
     tracker = t3d.load_tracker("lite", fast=False).double()
+    if neighborhood:
+        config = replace(tracker.config, neighborhood=neighborhood)
+        tracker.neighborhood = make_module("neighborhood", config, fast=False)
     with torch.no_grad():
         return tracker(*frames_and_queries(), space=space)[0].numpy()
 
