@@ -94,7 +94,9 @@ def _wrong_intrinsics(clip: Clip) -> list[Finding]:
             return []
         size = np.rint(2 * point + 1).astype(int)
         message = f"intrinsics look made for a {size[0]}x{size[1]} image, the video is {width}x{height}"
-        remedy = f"Multiply row 0 by {ratio[0]:.4g} and row 1 by {ratio[1]:.4g} (geometry.resize_intrinsics)."
+        remedy = (
+            f"Multiply row 0 by {ratio[0]:.4g} and row 1 by {ratio[1]:.4g}, or exactly: geometry.resize_intrinsics."
+        )
     else:
         return []
     after = float(np.abs(np.median(fix(clip).intrinsics[:, :2, 2], axis=0) / centre - 1).max())

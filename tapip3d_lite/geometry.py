@@ -118,28 +118,26 @@ def pixel_grid(height: int, width: int, like: Array) -> Array:
     return np.stack(np.meshgrid(u, v, indexing="xy"), -1)
 
 
-def resize_intrinsics(intrinsics: Array, old_size: tuple[int, int], new_size: tuple[int, int]) -> Array:
-    """Intrinsics of an image resized so that corner pixel centres map to corner pixel centres.
-
-    fx, skew and cx are multiplied by (W'-1)/(W-1), fy and cy by (H'-1)/(H-1), because pixel centres are integers.
+def resize_intrinsics(
+    intrinsics: Array, old_size: tuple[int, int], new_size: tuple[int, int], corners: bool = False
+) -> Array:
+    """Intrinsics of a resized image: u' = (u + 1/2) W' / W - 1/2, v' likewise, because images begin at -1/2.
 
     Args:
         intrinsics: (..., 3, 3).
-        old_size: (H, W) that the intrinsics belong to; both at least 2.
+        old_size: (H, W) that the intrinsics belong to.
         new_size: (H', W').
-
-    Returns:
-        (..., 3, 3).
+        corners: u' = u (W' - 1) / (W - 1) instead: corner centres stay corner centres, as in the released code.
 
     Raises:
-        ValueError: a size below 2 pixels, which has no scale.
+        ValueError: a size without pixels, or for `corners` below 2.
     """
-    if min(*old_size, *new_size) < 2:
-        raise ValueError(f"resize_intrinsics: sizes must be at least 2x2 pixels, got {old_size} -> {new_size}")
-    scale_u, scale_v = (new_size[1] - 1) / (old_size[1] - 1), (new_size[0] - 1) / (old_size[0] - 1)
-    xp = _library(intrinsics)
-    rows = [intrinsics[..., 0, :] * scale_u, intrinsics[..., 1, :] * scale_v, intrinsics[..., 2, :]]
-    return xp.stack(rows, -2)
+    if min(*old_size, *new_size) < 1 + corners:
+        raise ValueError(f"resize_intrinsics: sizes must be at least {1 + corners}, got {old_size} -> {new_size}")
+    scale_v, scale_u = ((new - corners) / (old - corners) for old, new in zip(old_size, new_size, strict=True))
+    half = intrinsics[..., 2, :] * (0 if corners else 0.5)
+    rows = [(intrinsics[..., 0, :] + half) * scale_u - half, (intrinsics[..., 1, :] + half) * scale_v - half]
+    return _library(intrinsics).stack([*rows, intrinsics[..., 2, :]], -2)
 
 
 def look_at(eye: Array, target: Array, up: Array) -> Array:

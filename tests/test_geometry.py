@@ -96,15 +96,22 @@ def test_points_behind_the_camera_stay_finite_and_keep_their_sign():
     assert z.tolist() == [-2, 0]
 
 
-def test_resize_intrinsics_keeps_corner_pixels_on_corner_pixels():
+def test_resized_intrinsics_keep_the_image_edges_or_on_demand_the_corner_pixels():
     rng = np.random.default_rng(4)
     k = random_intrinsics(rng, 3)
-    resized = resize_intrinsics(k, (48, 64), (24, 100))
-    corner = unproject(np.array([[[63.0, 47.0]]] * 3), np.full((3, 1), 2.0), k)
-    uv, _ = project(corner, resized)
-    np.testing.assert_allclose(uv, np.array([[[99.0, 23.0]]] * 3), atol=1e-9)
-    with pytest.raises(ValueError, match="at least 2x2"):
-        resize_intrinsics(k, (1, 64), (24, 100))
+    for corners, before, after in ((False, [63.5, 47.5], [99.5, 23.5]), (True, [63, 47], [99, 23])):
+        resized = resize_intrinsics(k, (48, 64), (24, 100), corners)
+        for start, end in ((before, after), (([-0.5] * 2,) * 2, ([0.0] * 2,) * 2)[corners]):
+            point = unproject(np.array([[start]] * 3), np.full((3, 1), 2.0), k)
+            uv, _ = project(point, resized)
+            np.testing.assert_allclose(uv, np.array([[end]] * 3), atol=1e-9)
+    np.testing.assert_allclose(resize_intrinsics(resize_intrinsics(k, (48, 64), (7, 9)), (7, 9), (48, 64)), k)
+    as_torch = resize_intrinsics(torch.from_numpy(k), (48, 64), (24, 100)).numpy()
+    np.testing.assert_allclose(as_torch, resize_intrinsics(k, (48, 64), (24, 100)))
+    with pytest.raises(ValueError, match="at least 2"):
+        resize_intrinsics(k, (1, 64), (24, 100), corners=True)
+    with pytest.raises(ValueError, match="at least 1"):
+        resize_intrinsics(k, (0, 64), (24, 100))
 
 
 def test_look_at_puts_the_target_on_the_axis_and_up_upwards():

@@ -12,7 +12,8 @@ import torch
 
 import tapip3d_lite as t3d
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.geometry import invert, transform
+from tapip3d_lite.geometry import invert, project, transform, unproject
+from tapip3d_lite.model import stream, track
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.model.n2n import Context
 from tapip3d_lite.model.neighbors import KNearest
@@ -470,6 +471,58 @@ def test_clips_of_another_size_are_resized(golden, clip):
     frames = frames_from_clip(larger, (48, 64))
     assert frames.size == (48, 64)
     assert torch.allclose(frames.intrinsics[0], torch.from_numpy(clip.intrinsics), atol=1e-3)
+
+
+def blob_clip(size, at, width=6.0):
+    """One frame of size (H, W) with a white blob around the pixel `at`, and a dent of the same form in its depth."""
+    v, u = np.mgrid[: size[0], : size[1]]
+    blob = np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * width**2))
+    intrinsics = np.array([[[110.0, 0, 60], [0, 90, 50], [0, 0, 1]]], np.float32)
+    video = np.rint(255 * blob)[None, ..., None].repeat(3, -1).astype(np.uint8)
+    return Clip(video, (3 - blob[None]).astype(np.float32), intrinsics, np.eye(4, dtype=np.float32)[None])
+
+
+def middle_of(weight):
+    """The centroid (u, v) of a map of weights."""
+    v, u = np.mgrid[: weight.shape[0], : weight.shape[1]]
+    return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
+
+
+@pytest.mark.parametrize("size", [(24, 32), (48, 64), (71, 100), (150, 333), (96, 50)], ids=str)
+def test_image_depth_and_camera_of_a_resized_clip_agree(size):
+    """A blob at a known point, found in the image and in the depth, against the point's projection."""
+    at = np.array([[24.0, 70.0]])
+    clip = blob_clip((96, 128), at[0])
+    point = unproject(at, np.full(1, 2.0), clip.intrinsics[0])
+    ratio = np.array([size[1] / 128, size[0] / 96])
+    ours, released = (resize_clip(clip, size, corners) for corners in (False, True))
+    assert np.array_equal(ours.video, released.video) and np.array_equal(ours.depths, released.depths)
+    seen, dented = middle_of(ours.video[0, ..., 0].astype(float)), middle_of(3.0 - ours.depths[0])
+    np.testing.assert_allclose(seen, dented, atol=0.02)
+    np.testing.assert_allclose(seen, project(point, ours.intrinsics[0])[0][0], atol=0.02)
+    # As released, the camera lies beside the image: by half of 1 - ratio at the edges, not at all in the middle.
+    beside = project(point, released.intrinsics[0])[0][0] - seen
+    share = 1 - 2 * at[0] / (np.array([128, 96]) - 1)
+    np.testing.assert_allclose(beside, share * (1 - ratio) / 2, atol=0.02)
+
+
+def test_only_the_released_model_keeps_the_released_rule(golden, clip, monkeypatch):
+    assert golden.tracker.config.corners and not TrackerConfig().corners and not TrackerConfig.preset("lite").corners
+    tracker, larger, rules = golden.tracker, resize_clip(clip, (96, 128)), []
+    for module in (track, stream):
+        spy = lambda clip, size, corners: rules.append(corners) or resize_clip(clip, size, corners)  # noqa: E731
+        monkeypatch.setattr(module, "resize_clip", spy)
+    queries, before = pixel_queries(larger), tracker.config
+    xyz = []
+    try:
+        for corners in (True, False):
+            tracker.config = before.replace(corners=corners)
+            xyz.append(tracker.track(larger, queries, iterations=1, support_grid=0, bidirectional=False).xyz)
+            online = tracker.stream(queries, iterations=1, support_grid=0)
+            online.push(larger.video[0], larger.depths[0], larger.intrinsics[0], larger.extrinsics[0])
+    finally:
+        tracker.config = before
+    assert rules == [True, True, False, False] and not np.array_equal(*xyz)
 
 
 def test_resized_depth_mixes_valid_pixels_only():

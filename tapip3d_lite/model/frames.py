@@ -1,8 +1,8 @@
 """`Frames`: a batch of posed RGB-D videos as tensors, and how a clip is brought to the model's image size.
 
-    fx' = fx (W' - 1) / (W - 1),   depth' = resized depth / resized validity
+    u' = (u + 1/2) W' / W - 1/2,   depth' = resized depth / resized validity
 
-Paper: section 3.2 (the input); resizing follows the released code.
+Paper: section 3.2 (the input). The released code moves the camera otherwise than the image (`TrackerConfig.corners`).
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _tensor(array: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(array))  # a mirrored clip's strides are negative
 
 
-def resize_clip(clip: Clip, size: tuple[int, int]) -> Clip:
+def resize_clip(clip: Clip, size: tuple[int, int], corners: bool = False) -> Clip:
     """The clip's frames at another image size, without its queries and tracks.
 
     Colours are interpolated linearly. Depth is interpolated over valid pixels only, that is divided by the
@@ -103,13 +103,15 @@ def resize_clip(clip: Clip, size: tuple[int, int]) -> Clip:
     Args:
         clip: T frames of any size.
         size: (H, W) wanted.
+        corners: the intrinsics follow the released code's rule, which OpenCV's images do not.
     """
     if clip.size == tuple(size):
         return clip
     shape = size[1], size[0]  # OpenCV writes (width, height)
     video = np.stack([cv2.resize(image, shape, interpolation=cv2.INTER_LINEAR) for image in clip.video])
     depths = np.stack([_resize_depth(depth, shape) for depth in clip.depths])
-    return Clip(video, depths, resize_intrinsics(clip.intrinsics, clip.size, size), clip.extrinsics, fps=clip.fps)
+    intrinsics = resize_intrinsics(clip.intrinsics, clip.size, size, corners)
+    return Clip(video, depths, intrinsics, clip.extrinsics, fps=clip.fps)
 
 
 def _resize_depth(depth: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

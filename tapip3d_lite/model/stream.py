@@ -89,7 +89,7 @@ class Stream:
             ValueError: arrays that do not fit, as for `Clip`.
         """
         clip = Clip(image[None], depth[None], np.asarray(intrinsics)[None], np.asarray(extrinsics)[None])
-        clip = resize_clip(clip, self.tracker.config.image_size)
+        clip = resize_clip(clip, self.tracker.config.image_size, self.tracker.config.corners)
         frames = frames_from_clip(clip, device=self.rows.device)
         if self.seen == 0:
             self.space = fitted(self.space, frames)

@@ -68,7 +68,7 @@ def track(
     support_grid = tracker.config.support_grid if support_grid is None else support_grid
     threshold = check_options(tracker, space, depth_roi, visible_threshold, support_grid)
     queries = resolve_queries(clip, queries)
-    clip = resize_clip(clip, tracker.config.image_size)
+    clip = resize_clip(clip, tracker.config.image_size, tracker.config.corners)
     roi = quantile_roi(torch.from_numpy(clip.depths)) if isinstance(depth_roi, str) else depth_roi
     options = {"iterations": iterations, "space": space, "depth_roi": roi}
     grids = [_grid(clip, support_grid, frame) for frame in (0, len(clip) - 1)]
