@@ -171,13 +171,13 @@ BOTH_WAYS = Exercise(
 
 
 def pool(bag: Tensor, token: Tensor, weights: Weights, heads: int, **slip: object) -> Tensor:
-    """A learned token (D,) gathers a bag (..., M, D) to (..., D): no norm, no residual. A `slip` makes one mistake."""
+    """A learned token (D,) gathers a bag (..., K, D) to (..., D): no norm, no residual. A `slip` makes one mistake."""
     w_q, w_k, w_v, w_o = (w.to(bag.dtype) for w in weights)
     heads = 1 if slip.get("one head") else heads
     query, keys = (w_q @ token).unflatten(-1, (heads, -1)), (bag @ w_k.T).unflatten(-1, (heads, -1))
     values = (bag @ (w_k if slip.get("keys") else w_v).T).unflatten(-1, (heads, -1))
     scale = {"none": 1, "token": len(token), "whole": len(w_q)}.get(slip.get("scale"), query.shape[-1])
-    share = ((keys * query).sum(-1) / scale**0.5).softmax(slip.get("axis", -2))  # (..., M, A)
+    share = ((keys * query).sum(-1) / scale**0.5).softmax(slip.get("axis", -2))  # (..., K, A)
     gathered = (share[..., None] * values).sum(-3).flatten(-2)
     return gathered if slip.get("no output") else gathered @ w_o.T
 

@@ -38,8 +38,8 @@ def fourier_waves(reach: float = 1.0, samples: int = 400) -> Figure:
         interpolation="nearest",
         extent=(0, reach, DEGREES[-1] + 0.5, DEGREES[0] - 0.5),
     )
-    left.set_title("sin(2^i x), one row a degree i", fontsize=9, color=INK)
-    label_axes(left, "degree i", "offset x (normalised)")
+    left.set_title(r"$\sin(2^i\delta)$, one row a degree $i$", fontsize=9, color=INK)
+    label_axes(left, "degree i", "offset (normalised)")
     left.grid(False)
     figure.colorbar(image, ax=left, fraction=0.04, pad=0.02).ax.tick_params(labelsize=8)
     distance = np.geomspace(1e-5, 10, samples * fine)
@@ -49,7 +49,7 @@ def fourier_waves(reach: float = 1.0, samples: int = 400) -> Figure:
         alike = np.cos(2.0**degrees * distance[:, None]).mean(-1).reshape(samples, fine).mean(1)
         right.semilogx(distance[::fine], alike, style, color=color, label=f"degrees {low} to {high}")
     right.set_title("likeness of two embeddings", fontsize=9, color=INK)
-    label_axes(right, "mean of cos(2^i distance)", "distance (normalised)")
+    label_axes(right, r"mean of cos($2^i$ · distance)", "distance (normalised)")
     right.legend(fontsize=8, frameon=False)
     return figure
 

@@ -111,11 +111,13 @@ FOURIER = Exercise(
 
 
 def attend(queries: Tensor, keys: Tensor, values: Tensor, heads: int, **slip: object) -> Tensor:
-    """What queries (..., Q, A d) find among keys and values (..., K, A d), every head for itself: (..., Q, A d).
+    """What queries (..., K + 1, A d) find among keys and values (..., K, A d), every head for itself: (..., K + 1, A d).
 
     A `slip` makes one mistake.
     """
-    q, k, v = (x.unflatten(-1, (heads, -1)).transpose(-2, -3) for x in (queries, keys, values))  # (..., A, Q or K, d)
+    q, k, v = (
+        x.unflatten(-1, (heads, -1)).transpose(-2, -3) for x in (queries, keys, values)
+    )  # (..., A, K + 1 or K, d)
     width = {"whole": queries.shape[-1], "none": 1, "squared": q.shape[-1] ** 2}.get(slip.get("scale"), q.shape[-1])
     weights = (q @ k.mT / width**0.5).softmax(slip.get("axis", -1))
     found = (weights.detach() if slip.get("cut") else weights) @ v
