@@ -91,7 +91,7 @@ class plugged:
 def frames_and_queries() -> tuple[Frames, torch.Tensor]:
     """One window of a real clip and the queries of its first frame, (1, N, 4), in double precision."""
     clip = t3d.load_clip(CLIP)
-    rows = clip.tracks.queries[clip.tracks.queries[:, 0] == 0]
+    rows = clip.tracks.queries[clip.tracks.queries[:, 0] < _FRAMES // 2]
     queries = torch.from_numpy(rows[:: len(rows) // _POINTS][:_POINTS]).double()[None]
     frames = frames_from_clip(clip).cut(0, _FRAMES)
     return Frames(*(x.double() for x in (frames.rgb, frames.depths, frames.intrinsics, frames.extrinsics))), queries
