@@ -13,6 +13,16 @@ from lessons.guesses import reveal
 from lessons.milestone import milestone
 from lessons.n01_cells import CELL_EXERCISES
 from lessons.n01_exercises import CAMERA_EXERCISES, random_extrinsics, random_intrinsics
+from lessons.n01_figures import (
+    cells_from_the_side,
+    cells_in_space,
+    from_the_side,
+    image_and_depth,
+    levels_from_above,
+    lines_over_pixels,
+    slip_over_depth,
+    two_liftings,
+)
 from lessons.pictures import pipeline, show
 from lessons.progress import collect, in_use, progress, reset
 from lessons.widgets import explore
@@ -21,10 +31,16 @@ from tapip3d_lite.model.cloud import Level
 
 __all__ = [
     "EXERCISES",
+    "cells_from_the_side",
+    "cells_in_space",
     "check",
     "collect",
     "explore",
+    "from_the_side",
+    "image_and_depth",
     "in_use",
+    "levels_from_above",
+    "lines_over_pixels",
     "milestone",
     "parts",
     "pipeline",
@@ -34,6 +50,8 @@ __all__ = [
     "reset",
     "reveal",
     "show",
+    "slip_over_depth",
+    "two_liftings",
 ]
 
 EXERCISES = CAMERA_EXERCISES + CELL_EXERCISES
