@@ -29,16 +29,18 @@ _FRAMES, _POINTS = 16, 16  # one window
 _METRES = 1e-3
 
 
-def milestone(*lessons: str) -> Verdict:
+def milestone(*lessons: str, spaces: tuple[str | None, ...] = (None,)) -> Verdict:
     """Track a clip with the learner's functions of some lessons, e.g. `milestone("03")`, and compare with the library.
 
+    `spaces` are those to track in, None for the tracker's own.
     Passed: each function is the learner's, the tracker called each, and no point is off by a millimetre.
     """
     calls: dict[str, int] = {}
     with plugged(lessons, calls):
-        mine = _tracks()
-    apart = float(np.abs(mine - _library()).max())
-    lines = [f"{len(calls)} functions in the tracker; tracks of {_POINTS} points over {_FRAMES} frames"]
+        mine = [_tracks(space) for space in spaces]
+    apart = max(float(np.abs(xyz - _library(space)).max()) for xyz, space in zip(mine, spaces, strict=True))
+    where = f", in the spaces {', '.join(map(str, spaces))}" if spaces != (None,) else ""
+    lines = [f"{len(calls)} functions in the tracker; tracks of {_POINTS} points over {_FRAMES} frames{where}"]
     for name, count in calls.items():
         whose = "yours" if progress.is_yours(name) else "the reference, until yours passes"
         lines.append(f"  {name}: {whose}, called {count} times")
@@ -89,18 +91,24 @@ class plugged:
 
 
 def frames_and_queries() -> tuple[Frames, torch.Tensor]:
-    """One window of a real clip and the queries of its first frame, (1, N, 4), in double precision."""
+    """One window of a clip and queries from its first half, (1, N, 4), in double precision."""
     clip = t3d.load_clip(CLIP)
     rows = clip.tracks.queries[clip.tracks.queries[:, 0] < _FRAMES // 2]
     queries = torch.from_numpy(rows[:: len(rows) // _POINTS][:_POINTS]).double()[None]
     frames = frames_from_clip(clip).cut(0, _FRAMES)
-    return Frames(*(x.double() for x in (frames.rgb, frames.depths, frames.intrinsics, frames.extrinsics))), queries
+    rgb, depths, intrinsics, poses = (
+        x.double() for x in (frames.rgb, frames.depths, frames.intrinsics, frames.extrinsics)
+    )
+    # A rotation of seven digits has a transpose that is not quite its inverse, and right answers may use either.
+    left, _, right = torch.linalg.svd(poses[..., :3, :3])
+    poses[..., :3, :3] = left @ right
+    return Frames(rgb, depths, intrinsics, poses), queries
 
 
-def _tracks() -> np.ndarray:
+def _tracks(space: str | None = None) -> np.ndarray:
     tracker = t3d.load_tracker("lite", fast=False).double()
     with torch.no_grad():
-        return tracker(*frames_and_queries())[0].numpy()
+        return tracker(*frames_and_queries(), space=space)[0].numpy()
 
 
 _library = cache(_tracks)
