@@ -115,13 +115,15 @@ def cells_from_the_side(surface: Array, kinds: Mapping[str, tuple[Array, Array]]
         return panel
 
     figure = panels(*(draw(title, *kind) for title, kind in kinds.items()), width=4.6, height=3.5)
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, markerscale=2
+    )
     return figure
 
 
 def cells_in_space(surface: Array, cells: Array, fly: Array) -> show_3d:
     """The same in three dimensions."""
-    groups = [("true surface", surface, GREY, "circle", ".", 1.5)]
+    groups = [("true surface", surface, GREY, "circle", "o", 1.0)]
     groups += [
         ("cell on a surface", cells[~fly], BLUE, "circle", "o", 3),
         ("flying cell", cells[fly], RED, "x", "x", 4),
@@ -135,7 +137,7 @@ def cells_in_space(surface: Array, cells: Array, fly: Array) -> show_3d:
         drawn.append((x, z, -y))
         marker = {"size": size, "color": color, "symbol": symbol}
         scene.add_scatter3d(x=x, y=z, z=-y, name=name, mode="markers", marker=marker, hoverinfo="skip")
-        ax.scatter(x, z, -y, s=size**2, color=color, marker=mark, label=name, depthshade=False)
+        ax.scatter(x, z, -y, s=size**2, color=color, marker=mark, lw=size / 3, label=name, depthshade=False)
     names = {"xaxis_title": "right (m)", "yaxis_title": "depth (m)", "zaxis_title": "up (m)"}
     view = {"aspectmode": "data", "camera": {"eye": {"x": -1.0, "y": -1.3, "z": 0.6}}}
     legend = {"itemsizing": "constant", "x": 0.02, "y": 0.98}
@@ -146,7 +148,7 @@ def cells_in_space(surface: Array, cells: Array, fly: Array) -> show_3d:
     ax.set_ylabel("depth (m)", fontsize=8)
     ax.set_zlabel("up (m)", fontsize=8)
     ax.tick_params(labelsize=7)
-    ax.legend(fontsize=8, frameon=False, loc="upper left")
+    ax.legend(fontsize=8, frameon=False, loc="upper left", markerscale=2)
     return show_3d(scene, twin)
 
 
