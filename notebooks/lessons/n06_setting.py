@@ -133,9 +133,9 @@ def gpu_setting(minutes: float, device: str = "cuda") -> Setting:
     gpu = torch.device(device).type == "cuda"
     recipe = TrainConfig(
         clips=max(64, round(80 * minutes)),
-        batch=16,
+        batch=8,
         frames=(8, 16),
-        iterations=(2, 3),
+        iterations=3,  # one number: each pair of frames and updates is recorded anew, and keeps a step's memory
         train_encoder=True,
         lr=1e-3,
         motion=MotionConfig(world=1.0, turned=0.0),
