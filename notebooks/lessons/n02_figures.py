@@ -108,13 +108,14 @@ def _widen(ax: Axes, least: float) -> None:
         ax.set_ylim(middle - least / 2, middle + least / 2)
 
 
-def gains(ratios: Mapping[str, np.ndarray], still: Mapping[str, np.ndarray]) -> Figure:
+def gains(ratios: Mapping[str, np.ndarray], still: Mapping[str, np.ndarray], window: int = 5) -> Figure:
     """What the strength of the hand does: ratios of moving points, and the bend of points at rest.
 
     Args:
         ratios: name of a fit to (4, 3): bend in camera coordinates over bend in the world, with its interval's ends,
             for a tripod and hands of strength 1 to 3.
         still: name of a space to the mean bends (4,) in cm.
+        window: frames of the windows in which those were measured.
     """
     figure = Figure(figsize=(9.4, 3.3), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -129,7 +130,7 @@ def gains(ratios: Mapping[str, np.ndarray], still: Mapping[str, np.ndarray]) -> 
     for name, values in still.items():  # thick below thin: three curves coincide
         right.plot(range(4), values, label=name, **STYLES[name])
     right.set(xlabel="strength of the hand (0: tripod)", ylabel="bend (cm)", xticks=range(4))
-    right.set_title("points at rest, straight line, 5 frames", fontsize=10)
+    right.set_title(f"points at rest, straight line, {window} frames", fontsize=10)
     for ax in (left, right):
         ax.legend(frameon=False, fontsize=8, handlelength=3.5)
     return figure
