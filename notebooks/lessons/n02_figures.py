@@ -149,7 +149,7 @@ def gravity_peak(ball: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray
     for name, values in bodies.items():
         share = 100 * np.histogram(values, edges)[0] / len(values)
         look = {key: value for key, value in STYLES[name].items() if key in ("color", "ls", "lw")}
-        right.stairs(share, edges, label=name, **look)
+        right.stairs(share, edges, baseline=None, label=name, **look)
     right.axvline(-9.81, color="#888", lw=0.8, ls=":", label="free fall")
     right.set(xlabel="upward acceleration (m/s²)", ylabel="points (%)", ylim=(0, None))
     right.set_title("points of moving bodies, hand 1", fontsize=10)
@@ -176,5 +176,5 @@ def noise_curves(sigmas: np.ndarray, curves: Mapping[str, tuple[np.ndarray, np.n
         top = 2.2 * camera.mean()
         ax.set(xlabel="pose noise σ (degrees)", ylabel="bend (cm)", ylim=(0, top), xlim=(0, sigmas[-1]))
         ax.set_title(title, fontsize=9)
-        ax.legend(frameon=False, fontsize=8, loc="lower right")
+        ax.legend(edgecolor="none", framealpha=0.9, fontsize=8, loc="lower right")
     return figure
