@@ -25,7 +25,7 @@ from tapip3d_lite.model.frames import Frames, frames_from_clip
 
 Use = Callable[[str], Callable[..., object]]
 CLIP = Path(__file__).parents[2] / "data_samples" / "handheld.npz"
-_FRAMES, _POINTS = 16, 16  # one window
+_FRAMES, _POINTS = 16, 16
 _METRES = 1e-3
 
 
@@ -91,7 +91,7 @@ class plugged:
 
 
 def frames_and_queries() -> tuple[Frames, torch.Tensor]:
-    """One window of a clip and queries from its first half, (1, N, 4), in double precision."""
+    """The first frames of a clip and queries in half of them, (1, N, 4), in double precision."""
     clip = t3d.load_clip(CLIP)
     rows = clip.tracks.queries[clip.tracks.queries[:, 0] < _FRAMES // 2]
     queries = torch.from_numpy(rows[:: len(rows) // _POINTS][:_POINTS]).double()[None]
