@@ -2,6 +2,8 @@
 
 Each lesson's `parts(use)` names places in the library, as `"module:attribute"`, and what stands there while the
 functions are plugged in: `use("01.unproject")` gives the learner's function, or the reference while there is none.
+Where lessons meet, one may name places in `KEPT` that another one must leave to the library, as its own functions
+would not be called any more.
 Tracks are computed in double precision: the method amplifies differences of the last digit, and in single precision
 two right orders of summation could give different tracks.
 """
@@ -25,7 +27,7 @@ from tapip3d_lite.model.frames import Frames, frames_from_clip
 
 Use = Callable[[str], Callable[..., object]]
 CLIP = Path(__file__).parents[2] / "data_samples" / "handheld.npz"
-_FRAMES, _POINTS = 16, 16  # one window
+_FRAMES, _POINTS = 16, 16
 _METRES = 1e-3
 
 
@@ -62,8 +64,11 @@ class plugged:
     def __init__(self, lessons: tuple[str, ...], calls: dict[str, int] | None = None) -> None:
         self.calls = {} if calls is None else calls
         self.places: dict[str, object] = {}
-        for lesson in lessons:
-            self.places |= import_module(f"lessons.n{lesson}").parts(self._use)
+        modules = [import_module(f"lessons.n{lesson}") for lesson in lessons]
+        for module in modules:
+            self.places |= module.parts(self._use)
+        for place in (place for module in modules for place in getattr(module, "KEPT", ())):
+            self.places.pop(place, None)
         self._stack = ExitStack()
 
     def _use(self, name: str) -> Callable[..., object]:
@@ -91,7 +96,7 @@ class plugged:
 
 
 def frames_and_queries() -> tuple[Frames, torch.Tensor]:
-    """One window of a clip and queries from its first half, (1, N, 4), in double precision."""
+    """The first frames of a clip and queries in half of them, (1, N, 4), in double precision."""
     clip = t3d.load_clip(CLIP)
     rows = clip.tracks.queries[clip.tracks.queries[:, 0] < _FRAMES // 2]
     queries = torch.from_numpy(rows[:: len(rows) // _POINTS][:_POINTS]).double()[None]
