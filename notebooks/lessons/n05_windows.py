@@ -50,11 +50,6 @@ WINDOWS = Exercise(
             "a clip of at most S / 2 frames has no window at all: its points stay at their queries.",
         ),
         Mistake(
-            "cut, not padded",
-            lambda t, s: np.arange(0, t // (s // 2) * (s // 2) - s + 1, s // 2),
-            "round up to whole half windows, not down: no frame may be lost.",
-        ),
-        Mistake(
             "windows over the end",
             lambda t, s: np.arange(0, t, s // 2),
             "a window must end within the padded clip: start + S <= padded length.",
@@ -132,16 +127,16 @@ HAND_OVER = Exercise(
 
 
 class Flight:
-    """A stand-in for a tracker, as a case of an exercise: queries (N, 4) to tracks (T, N, 3) that meet their queries."""
+    """A stand-in for a tracker, as a case of an exercise: queries (N, 4) to tracks (T, N, 3)."""
 
-    def __init__(self, frames: int, speed: Array, name: str) -> None:
-        self.frames, self.speed, self.name = frames, speed, name
+    def __init__(self, frames: int, speed: Array, miss: float, name: str) -> None:
+        self.frames, self.speed, self.miss, self.name = frames, speed, miss, name
 
     def __call__(self, queries: Array) -> Array:
-        """Straight flights through the queries, each in its own direction."""
+        """Straight flights close by the queries, each at its own speed."""
         turned = self.speed * (1 + np.arange(len(queries)))[:, None]  # a track has its own speed
         after = np.arange(self.frames)[:, None] - queries[:, 0]
-        return queries[:, 1:] + after[..., None] * turned + 0.1
+        return queries[:, 1:] + after[..., None] * turned + self.miss
 
     def __repr__(self) -> str:
         return f"<{self.name} pass>"
@@ -156,7 +151,11 @@ def both_ways(forward: Pass, backward: Pass, queries: Array, slip: str = "") -> 
     back = backward(turned)
     back = back if slip == "not turned back" else back[::-1]
     t = np.arange(frames)[:, None]
-    before = {"query frame from the wrong pass": t <= times, "sides exchanged": t > times, "queries overwritten": t < turned[:, 0]}.get(slip, t < times)
+    before = {
+        "query frame from the wrong pass": t <= times,
+        "sides exchanged": t > times,
+        "queries overwritten": t < turned[:, 0],
+    }.get(slip, t < times)
     if slip == "mean":
         return (there + back) / 2
     return there if slip == "forward" else np.where(before[..., None], back, there)
@@ -166,7 +165,7 @@ def _backward_case(rng: np.random.Generator, size: int) -> tuple:
     frames = size + 3
     times = rng.permutation(np.r_[0, frames - 1, rng.integers(0, frames, size)])
     queries = np.concatenate([times[:, None], rng.normal(size=(len(times), 3))], -1)
-    return *(Flight(frames, rng.normal(size=3), name) for name in ("forward", "backward")), queries
+    return *(Flight(frames, rng.normal(size=3), rng.normal(), name) for name in ("forward", "backward")), queries
 
 
 def _both_ways(slip: str) -> Callable[..., Array]:
