@@ -114,7 +114,7 @@ def token_parts(config: TrackerConfig, width: int) -> dict[str, int]:
     """Channels of every part of the token; `width` is the context's width at one level."""
     levels = {f"evidence, level {i}": width for i in range(config.levels)}
     motion = {"motion to next and last frame": 6 * FACTOR}
-    return {"visibility": 1} | levels | motion | ({"pixel (u, v)": 2 * FACTOR} if config.use_uv else {})
+    return {"visibility": 1} | levels | motion | ({"pixel": 2 * FACTOR} if config.use_uv else {})
 
 
 def time_in_turns(calls: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:

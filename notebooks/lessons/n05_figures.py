@@ -17,7 +17,7 @@ _T95 = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23, 2.20, 2.18,
 
 def token_bar(parts: Mapping[str, int]) -> Figure:
     """A token as one bar, its parts side by side with their names and widths."""
-    figure = Figure(figsize=(10.2, 1.8), layout="constrained")
+    figure = Figure(figsize=(10.2, 2.5), layout="constrained")
     ax, start, whole = figure.subplots(), 0, sum(parts.values())
     for i, (name, width) in enumerate(parts.items()):
         ax.barh(0, width, left=start, color=OKABE[i % len(OKABE)], alpha=0.55, edgecolor=INK, lw=0.6)
@@ -39,8 +39,10 @@ def looks_over_time(looks: np.ndarray) -> Figure:
     axes = figure.subplots(1, len(looks), sharey=True)
     for i, (ax, weights) in enumerate(zip(axes, looks, strict=True)):
         shown = ax.imshow(weights, cmap="viridis", vmin=0, vmax=1)
+        ax.set_xticks(range(0, len(weights), 2))
         ax.set_title(f"head {i + 1}", fontsize=10, color=INK)
         label_axes(ax, "frame that looks" if i == 0 else "", "frame that is seen")
+        ax.grid(visible=False)
         for t, row in enumerate(weights):
             best = int(row.argmax())
             ax.text(best, t, "×", ha="center", va="center", fontsize=11, color="white" if row[best] < 0.6 else "black")
@@ -59,6 +61,7 @@ def heard(matrices: Sequence[np.ndarray], still: int) -> Figure:
             side(still - 0.5, color="white", lw=1.2)
         ax.set_title(f"group {i + 1}", fontsize=10, color=INK)
         label_axes(ax, "point that hears" if i == 0 else "", "point that is heard")
+        ax.grid(visible=False)
         figure.colorbar(shown, ax=ax, fraction=0.046, label="% of own effect" if i == len(matrices) - 1 else "")
     return figure
 

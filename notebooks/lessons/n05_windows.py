@@ -23,9 +23,9 @@ def _padded(frames: int, multiple: int) -> int:
 
 
 def _windows_case(rng: np.random.Generator, size: int) -> tuple:
-    half = size + 1
-    low, high = [(1, half), (half + 1, 2 * half), (2 * half, 5 * half)][int(rng.integers(3))]
-    return int(rng.integers(low, high + 1)), 2 * half
+    half = size
+    short, longer = rng.integers(1, half + 1), rng.integers(half + 1, 6 * half + 1)
+    return int(short if rng.random() < 0.3 else longer), 2 * half
 
 
 WINDOWS = Exercise(
