@@ -30,18 +30,20 @@ _FRAMES, _POINTS = 16, 16  # three windows
 _METRES = 1e-3
 
 
-def milestone(*lessons: str) -> Verdict:
+def milestone(*lessons: str, spaces: tuple[str | None, ...] = (None,)) -> Verdict:
     """Track a clip with the learner's functions of some lessons, e.g. `milestone("03")`, and compare with the library.
 
-    Points are asked for in the first frame; in all frames, and tracked both ways in time, where a lesson has `BOTH_WAYS`.
+    `spaces` are those to track in, None for the tracker's own. Where a lesson has `BOTH_WAYS`, points are asked for in
+    all frames and tracked both ways in time.
     Passed: each function is the learner's, the tracker called each, and no point is off by a millimetre.
     """
     calls: dict[str, int] = {}
     late = any(getattr(import_module(f"lessons.n{lesson}"), "BOTH_WAYS", False) for lesson in lessons)
     with plugged(lessons, calls):
-        mine = _tracks(late)
-    apart = float(np.abs(mine - _library(late)).max())
-    lines = [f"{len(calls)} functions in the tracker; tracks of {mine.shape[1]} points over {len(mine)} frames"]
+        mine = [_tracks(space, late) for space in spaces]
+    apart = max(float(np.abs(xyz - _library(space, late)).max()) for xyz, space in zip(mine, spaces, strict=True))
+    where = f", in the spaces {', '.join(map(str, spaces))}" if spaces != (None,) else ""
+    lines = [f"{len(calls)} functions in the tracker; tracks of {_POINTS} points over {_FRAMES} frames{where}"]
     for name, count in calls.items():
         whose = "yours" if progress.is_yours(name) else "the reference, until yours passes"
         lines.append(f"  {name}: {whose}, called {count} times")
@@ -92,32 +94,37 @@ class plugged:
 
 
 def frames_and_queries(late: bool = False) -> tuple[Frames, torch.Tensor]:
-    """Frames of a real clip and queries (1, N, 4) of its first frame, or of all frames, in double precision."""
+    """Frames of a clip and queries (1, N, 4) from their first half, or from all of them, in double precision."""
     clip = t3d.load_clip(CLIP)
-    rows = clip.tracks.queries[clip.tracks.queries[:, 0] < (_FRAMES if late else 1)]
-    queries = torch.from_numpy(rows[:: max(1, len(rows) // _POINTS)][:_POINTS]).double()[None]
+    rows = clip.tracks.queries[clip.tracks.queries[:, 0] < (_FRAMES if late else _FRAMES // 2)]
+    queries = torch.from_numpy(rows[:: len(rows) // _POINTS][:_POINTS]).double()[None]
     frames = frames_from_clip(clip).cut(0, _FRAMES)
-    return Frames(*(x.double() for x in (frames.rgb, frames.depths, frames.intrinsics, frames.extrinsics))), queries
+    rgb, depths, intrinsics, poses = (
+        x.double() for x in (frames.rgb, frames.depths, frames.intrinsics, frames.extrinsics)
+    )
+    # A rotation of seven digits has a transpose that is not quite its inverse, and right answers may use either.
+    left, _, right = torch.linalg.svd(poses[..., :3, :3])
+    poses[..., :3, :3] = left @ right
+    return Frames(rgb, depths, intrinsics, poses), queries
 
 
 def both_ways(forward: Pass, backward: Pass, queries: np.ndarray) -> np.ndarray:
     """Tracks (T, N, 3) joined from two passes as `model.track.track` joins them, which knows single precision only."""
-    turned = queries.copy()
-    there = forward(queries)
+    there, turned = forward(queries), queries.copy()
     turned[:, 0] = len(there) - 1 - turned[:, 0]
     before = np.arange(len(there))[:, None] < queries[:, 0]
     return np.where(before[..., None], backward(turned)[::-1], there)
 
 
-def _tracks(late: bool) -> np.ndarray:
+def _tracks(space: str | None = None, late: bool = False) -> np.ndarray:
     tracker = t3d.load_tracker("lite", fast=False).double()
     frames, queries = frames_and_queries(late)
 
     def way(frames: Frames) -> Pass:
-        return lambda rows: tracker(frames, torch.from_numpy(rows)[None])[0][0].numpy()
+        return lambda rows: tracker(frames, torch.from_numpy(rows)[None], space=space)[0][0].numpy()
 
+    rows = queries[0].numpy()
     with torch.no_grad():
-        rows = queries[0].numpy()
         return both_ways(way(frames), way(frames.flip()), rows) if late else way(frames)(rows)
 
 

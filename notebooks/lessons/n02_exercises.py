@@ -1,4 +1,4 @@
-"""Exercises of notebook 02: coordinate spaces, the bend of a path, cancelling the camera, gravity from a track."""
+"""Exercises of notebook 02 on spaces: one world re-based to another, and the bend of paths through per-frame maps."""
 
 from __future__ import annotations
 
@@ -6,39 +6,47 @@ import numpy as np
 
 from lessons.checker import Exercise, Mistake
 from lessons.n01 import random_extrinsics, random_intrinsics
-from lessons.n02_straightness import fit_windows, from_space, to_space
+from lessons.n02_pose_exercises import CROSSING, DRIFT, POSE_ERROR
+from lessons.n02_straightness import from_space, line_through, to_space
 from tapip3d_lite.geometry import invert, transform, unproject
 
 Array = np.ndarray
 
 
 def _cameras(rng: np.random.Generator, frames: int) -> tuple[Array, Array]:
+    """Cameras that differ from frame to frame, inside and outside."""
     intrinsics = np.stack([random_intrinsics(rng) for _ in range(frames)])
     return intrinsics, np.stack([random_extrinsics(rng) for _ in range(frames)])
 
 
-def _filmed(rng: np.random.Generator, size: int) -> tuple:
+def _filmed(rng: np.random.Generator, size: int) -> tuple[Array, Array, Array]:
     """World paths (T, N, 3) in front of all cameras."""
-    frames = size + 1
+    frames = 2 * size + 2
     intrinsics, extrinsics = _cameras(rng, frames)
     camera = np.concatenate([rng.uniform(-1, 1, (frames, size, 2)), rng.uniform(2, 6, (frames, size, 1))], -1)
     return transform(camera, invert(extrinsics)), intrinsics, extrinsics
 
 
-def to_uvd(xyz: Array, intrinsics: Array, extrinsics: Array) -> Array:
-    """World paths (T, N, 3) as (u, v, z) in each frame's own image."""
-    return to_space(xyz, intrinsics, extrinsics, "uvd")
+def _worlds(rng: np.random.Generator, size: int) -> tuple[Array, Array, Array]:
+    frames = size + 2
+    _, extrinsics = _cameras(rng, frames)
+    return rng.normal(size=(frames, size, 3)), extrinsics, _cameras(rng, frames)[1]
 
 
-def _without_division(xyz: Array, intrinsics: Array, extrinsics: Array) -> Array:
-    camera = transform(xyz, extrinsics)
-    uv = camera[..., :2] * intrinsics[:, None, [0, 1], [0, 1]] + intrinsics[:, None, :2, 2]
-    return np.concatenate([uv, camera[..., 2:]], -1)
+def rebase(points: Array, extrinsics: Array, anchors: Array) -> tuple[Array, Array]:
+    """Points (T, N, 3) and cameras (T, 4, 4) of a world, both in the frame that anchors (T, 4, 4) map the world to."""
+    return transform(points, anchors), extrinsics @ invert(anchors)
 
 
-def _transposed(extrinsics: Array) -> Array:
-    turned = extrinsics.copy()
+def _transposed(pose: Array) -> Array:
+    turned = pose.copy()
     turned[:, :3, :3] = turned[:, :3, :3].swapaxes(1, 2)
+    return turned
+
+
+def _half_inverted(pose: Array) -> Array:
+    turned = _transposed(pose)
+    turned[:, :3, 3] *= -1
     return turned
 
 
@@ -46,204 +54,206 @@ def _first(cameras: Array) -> Array:
     return np.repeat(cameras[:1], len(cameras), 0)
 
 
-def _with_third(uvd: Array, third: Array) -> Array:
-    return np.concatenate([uvd[..., :2], third[..., None]], -1)
-
-
-TO_UVD = Exercise(
-    "02.to_uvd",
-    reference=to_uvd,
-    cases=_filmed,
+REBASE = Exercise(
+    "02.rebase",
+    reference=rebase,
+    cases=_worlds,
     mistakes=(
         Mistake(
-            "extrinsics inverted",
-            lambda x, k, e: to_uvd(x, k, invert(e)),
-            "extrinsics already map world to camera; do not invert them here.",
+            "cameras left behind",
+            lambda x, e, a: (transform(x, a), e),
+            "the points have moved to the new frame, the cameras have not: they must see the same as before.",
+        ),
+        Mistake(
+            "points left behind",
+            lambda x, e, a: (x, e @ invert(a)),
+            "the cameras belong to the new frame, the points still to the old one.",
+        ),
+        Mistake(
+            "anchor not inverted",
+            lambda x, e, a: (transform(x, a), e @ a),
+            "the new cameras get points of the new frame, so they first lead back to the old one: invert the anchor.",
+        ),
+        Mistake(
+            "anchor on the wrong side",
+            lambda x, e, a: (transform(x, a), invert(a) @ e),
+            "the step that happens first stands on the right: back to the old world first, then into the camera.",
+        ),
+        Mistake(
+            "points by the inverse",
+            lambda x, e, a: (transform(x, invert(a)), e @ invert(a)),
+            "anchors map from the old world to the new frame already; the points need them as they are.",
+        ),
+        Mistake(
+            "all the other way round",
+            lambda x, e, a: (transform(x, invert(a)), e @ a),
+            "points and cameras fit together, but you took the anchors for maps from the new frame to the old.",
+        ),
+        Mistake(
+            "first frame's anchor",
+            lambda x, e, a: (transform(x, _first(a)), e @ invert(_first(a))),
+            "each frame has its own anchor: use anchors[t].",
+        ),
+        Mistake(
+            "R^T x - b for the inverse",
+            lambda x, e, a: (transform(x, a), e @ _half_inverted(a)),
+            "the inverse of x' = R x + b is R^T (x' - b) = R^T x' - R^T b: the translation is turned back, too.",
         ),
         Mistake(
             "transposed matrix",
-            lambda x, k, e: to_uvd(x, k, _transposed(e)),
-            "points are rows: R acts on them as x @ R.T (plus t), not as x @ R.",
-        ),
-        Mistake("missing division by z", _without_division, "perspective divides: u = fx x / z + cx. You left out z."),
-        Mistake(
-            "world height for depth",
-            lambda x, k, e: _with_third(to_uvd(x, k, e), x[..., 2]),
-            "the third number is the depth: z in the camera's frame, not the world's z.",
+            lambda x, e, a: (transform(x, _transposed(a)), e @ invert(a)),
+            "points are rows: R acts on them as x @ R.T (plus b), not as x @ R.",
         ),
         Mistake(
-            "ray length for depth",
-            lambda x, k, e: _with_third(to_uvd(x, k, e), np.linalg.norm(transform(x, e), axis=-1)),
-            "depth is measured along the viewing axis, not along the ray.",
+            "translation forgotten",
+            lambda x, e, a: (x @ a[:, :3, :3].swapaxes(1, 2), e @ invert(a)),
+            "you only turned the points; the anchor's translation is missing.",
         ),
         Mistake(
-            "first frame's camera",
-            lambda x, k, e: to_uvd(x, _first(k), _first(e)),
-            "every frame has its own camera: use intrinsics[t] and extrinsics[t].",
-        ),
-        Mistake(
-            "pixel-centre slip",
-            lambda x, k, e: to_uvd(x, k, e) + np.array([0.5, 0.5, 0]),
-            "you are half a pixel off: pixel centres are whole numbers here.",
+            "no camera motion left",
+            lambda x, e, a: (transform(x, a), np.tile(np.eye(4), (len(e), 1, 1))),
+            "only for anchors = extrinsics are the new cameras identities; here anchors can be anything.",
         ),
     ),
 )
 
 
-def _path(rng: np.random.Generator, size: int) -> tuple:
-    return (rng.normal(size=(3 + 2 * size, 3)).cumsum(0),)
+def bend_in_uvd(xyz: Array, intrinsics: Array, extrinsics: Array) -> Array:
+    """RMS distances (N,) between world paths (S, N, 3) and their constant-velocity fits in (u, v, z)."""
+    return _bent(xyz, intrinsics, extrinsics)
 
 
-def bend(path: Array) -> Array:
-    """RMS distance between a path (S, 3) and its best constant-velocity fit."""
-    return _rms(path - fit_windows(path[:, None], len(path), 1)[0, :, 0])
+def _bent(xyz: Array, k: Array, e: Array, space: str = "uvd", line: object = line_through) -> Array:
+    return _rms(from_space(line(to_space(xyz, k, e, space)), k, e, space) - xyz)
 
 
 def _rms(rest: Array) -> Array:
-    return np.sqrt((rest**2).sum(-1).mean())
+    return np.sqrt((rest**2).sum(-1).mean(0))
 
 
 def _chord(path: Array) -> Array:
-    share = np.linspace(0, 1, len(path))[:, None]
-    return _rms(path - (path[0] + share * (path[-1] - path[0])))
+    share = np.linspace(0, 1, len(path))[:, None, None]
+    return path[0] + share * (path[-1] - path[0])
 
 
 def _through_origin(path: Array) -> Array:
-    t = np.arange(len(path))[:, None]
-    return _rms(path - t * (t * path).sum(0) / (t**2).sum())
+    t = np.arange(len(path))[:, None, None]
+    return t * (t * path).sum(0) / (t**2).sum()
+
+
+def _back_wrong(xyz: Array, k: Array, e: Array, k_back: Array, e_back: Array) -> Array:
+    return _rms(from_space(line_through(to_space(xyz, k, e, "uvd")), k_back, e_back, "uvd") - xyz)
+
+
+def _half_back(xyz: Array, k: Array, e: Array) -> Array:
+    line = line_through(to_space(xyz, k, e, "uvd"))
+    camera = unproject(line[..., :2], line[..., 2], k)
+    return _rms(camera @ e[:, :3, :3] - e[:, None, :3, 3] - xyz)
+
+
+def _rays_for_depth(xyz: Array, k: Array, e: Array) -> Array:
+    uvd = to_space(xyz, k, e, "uvd")
+    uvd[..., 2] = np.linalg.norm(transform(xyz, e), axis=-1)
+    return _rms(from_space(line_through(uvd), k, e, "uvd") - xyz)
 
 
 BEND = Exercise(
-    "02.bend",
-    reference=bend,
-    cases=_path,
+    "02.bend_in_uvd",
+    reference=bend_in_uvd,
+    cases=_filmed,
     mistakes=(
         Mistake(
+            "compared in uvd",
+            lambda x, k, e: _rms(line_through(to_space(x, k, e, "uvd")) - to_space(x, k, e, "uvd")),
+            "this adds pixels to metres; carry the fit back to 3D and compare it with the path there.",
+        ),
+        Mistake(
+            "compared in the camera",
+            lambda x, k, e: _rms(unproject(*_uv_z(line_through(to_space(x, k, e, "uvd"))), k) - x),
+            "your fit ends in camera coordinates, the path is in the world: apply the inverse of extrinsics[t], too.",
+        ),
+        Mistake(
+            "fitted in the world",
+            lambda x, k, e: _bent(x, k, e, "world"),
+            "this line is fitted in the world; fit it to (u, v, z).",
+        ),
+        Mistake(
+            "fitted in the camera",
+            lambda x, k, e: _bent(x, k, e, "camera"),
+            "this line is fitted to camera coordinates in metres; fit it to (u, v, z).",
+        ),
+        Mistake(
+            "first pose both ways",
+            lambda x, k, e: _bent(x, k, _first(e)),
+            "one pose for all frames: the camera stands still in your uvd. Every frame has its own extrinsics[t].",
+        ),
+        Mistake(
+            "first pose on the way back",
+            lambda x, k, e: _back_wrong(x, k, e, k, _first(e)),
+            "the way out used the pose of each frame, the way back only that of frame 0; go back through extrinsics[t].",
+        ),
+        Mistake(
+            "first intrinsics both ways",
+            lambda x, k, e: _bent(x, _first(k), e),
+            "the lens may zoom: every frame has its own intrinsics[t], you used those of frame 0.",
+        ),
+        Mistake(
+            "first intrinsics on the way back",
+            lambda x, k, e: _back_wrong(x, k, e, _first(k), e),
+            "the way out used the intrinsics of each frame, the way back only those of frame 0; use intrinsics[t].",
+        ),
+        Mistake(
+            "first camera both ways",
+            lambda x, k, e: _bent(x, _first(k), _first(e)),
+            "one camera for all frames: neither its motion nor its zoom is in your uvd. Use intrinsics[t], extrinsics[t].",
+        ),
+        Mistake(
+            "R^T x - b on the way back",
+            _half_back,
+            "the inverse of x' = R x + b is R^T (x' - b): subtract b first, then turn back.",
+        ),
+        Mistake(
+            "extrinsics inverted",
+            lambda x, k, e: _bent(x, k, invert(e)),
+            "extrinsics already map world to camera; invert them only on the way back.",
+        ),
+        Mistake(
+            "ray length for depth",
+            _rays_for_depth,
+            "the third number is the depth along the viewing axis, not the length of the ray.",
+        ),
+        Mistake(
             "line through the ends",
-            _chord,
+            lambda x, k, e: _bent(x, k, e, line=_chord),
             "the line through the first and the last point is not the best one; least squares uses them all.",
         ),
         Mistake(
             "rest instead of motion",
-            lambda x: _rms(x - x.mean(0)),
-            "this is the distance to a resting point; fit a constant velocity as well.",
+            lambda x, k, e: _bent(x, k, e, line=lambda p: p.mean(0) + 0 * p),
+            "this is the distance to a resting pixel; fit a velocity as well.",
         ),
-        Mistake("no offset", _through_origin, "your line starts at the origin; fit an offset a beside the velocity b."),
+        Mistake(
+            "no offset",
+            lambda x, k, e: _bent(x, k, e, line=_through_origin),
+            "your line starts at (0, 0, 0); fit an offset beside the velocity.",
+        ),
         Mistake(
             "mean over coordinates",
-            lambda x: bend(x) / np.sqrt(3),
+            lambda x, k, e: _bent(x, k, e) / np.sqrt(3),
             "sum the squares over x, y, z first, then take the mean over frames.",
         ),
+        Mistake("no root", lambda x, k, e: _bent(x, k, e) ** 2, "this is the mean square, in m²; take the root."),
         Mistake(
-            "no square root",
-            lambda x: bend(x) ** 2,
-            "this is the mean square, in square metres; take the root.",
+            "one number for all",
+            lambda x, k, e: np.sqrt((_bent(x, k, e) ** 2).mean()),
+            "average over frames only: each of the N points has its own bend.",
         ),
     ),
 )
 
 
-def _measured(rng: np.random.Generator, size: int) -> tuple:
-    xyz, intrinsics, extrinsics = _filmed(rng, size)
-    return to_uvd(xyz, intrinsics, extrinsics), intrinsics, extrinsics
+def _uv_z(uvd: Array) -> tuple[Array, Array]:
+    return uvd[..., :2], uvd[..., 2]
 
 
-def cancel(uvd: Array, intrinsics: Array, extrinsics: Array) -> Array:
-    """Paths (T, N, 3) of (u, v, z) in world coordinates."""
-    return from_space(uvd, intrinsics, extrinsics, "uvd")
-
-
-def _camera(uvd: Array, intrinsics: Array) -> Array:
-    return unproject(uvd[..., :2], uvd[..., 2], intrinsics)
-
-
-CANCEL = Exercise(
-    "02.cancel",
-    reference=cancel,
-    cases=_measured,
-    mistakes=(
-        Mistake(
-            "wrong direction",
-            lambda x, k, e: transform(_camera(x, k), e),
-            "extrinsics map world to camera; to cancel the camera's motion apply their inverse.",
-        ),
-        Mistake(
-            "still in the camera",
-            lambda x, k, e: _camera(x, k),
-            "these are camera coordinates: the camera's motion is still in them. Apply the inverse of extrinsics[t].",
-        ),
-        Mistake(
-            "translation kept",
-            lambda x, k, e: _camera(x, k) @ e[:, :3, :3] + e[:, None, :3, 3],
-            "the inverse of x' = R x + t is R^T (x' - t): subtract t first, then turn back.",
-        ),
-        Mistake(
-            "transposed matrix",
-            lambda x, k, e: (_camera(x, k) - e[:, None, :3, 3]) @ e[:, :3, :3].swapaxes(1, 2),
-            "points are rows: x @ R already applies R^T to each of them.",
-        ),
-        Mistake(
-            "missing depth",
-            lambda x, k, e: cancel(_with_third(x, np.ones_like(x[..., 2])), k, e),
-            "multiply the ray by the depth: x = (u - cx) z / fx.",
-        ),
-        Mistake(
-            "off by one in time",
-            lambda x, k, e: cancel(x, k, np.concatenate([e[:1], e[:-1]])),
-            "you undo the camera of the frame before; frame t needs extrinsics[t].",
-        ),
-        Mistake(
-            "first frame's camera",
-            lambda x, k, e: cancel(x, _first(k), _first(e)),
-            "with one camera for all frames its motion is not cancelled; use the camera of each frame.",
-        ),
-        Mistake(
-            "pixel-centre slip",
-            lambda x, k, e: cancel(x + np.array([0.5, 0.5, 0]), k, e),
-            "you are half a pixel off: pixel centres are whole numbers here.",
-        ),
-    ),
-)
-
-
-def _thrown(rng: np.random.Generator, size: int) -> tuple:
-    fps, frames = float(rng.choice([12, 24, 30])), 4 + size
-    seconds = np.arange(frames) / fps
-    # Any planet will do, so that 9.81 cannot be typed in; always a throw with speed of its own.
-    fall = rng.uniform(1, 20)
-    return rng.uniform(0, 2) + rng.uniform(2, 6) * seconds - fall / 2 * seconds**2, fps
-
-
-def gravity(height: Array, fps: float) -> Array:
-    """Downward acceleration (m/s^2) from the heights (T,) of a body in free flight."""
-    return -np.diff(height, n=2).mean() * fps**2
-
-
-GRAVITY = Exercise(
-    "02.gravity",
-    reference=gravity,
-    cases=_thrown,
-    mistakes=(
-        Mistake(
-            "sign", lambda h, fps: -gravity(h, fps), "height is measured upwards and the body falls: mind the sign."
-        ),
-        Mistake(
-            "fps once",
-            lambda h, fps: gravity(h, fps) / fps,
-            "a second difference is per frame squared: multiply by fps twice.",
-        ),
-        Mistake("frames for seconds", lambda h, fps: gravity(h, 1.0), "this is per frame; convert it to seconds."),
-        Mistake(
-            "velocity",
-            lambda h, fps: -np.diff(h).mean() * fps,
-            "this is a velocity; the acceleration is the difference of differences.",
-        ),
-        Mistake(
-            "half of it",
-            lambda h, fps: gravity(h, fps) / 2,
-            "the second difference of -g t^2 / 2 is -g per frame squared, without the half.",
-        ),
-    ),
-)
-
-EXERCISES = (TO_UVD, BEND, CANCEL, GRAVITY)
+EXERCISES = (REBASE, BEND, POSE_ERROR, DRIFT, CROSSING)

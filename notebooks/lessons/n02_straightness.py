@@ -76,6 +76,22 @@ def fit_windows(coords: np.ndarray, window: int = 5, degree: int = 1) -> np.ndar
     return np.einsum("st,wtnc->wsnc", smooth, windows(coords, window), optimize=True)
 
 
+def line_through(coords: np.ndarray) -> np.ndarray:
+    """The best constant-velocity motion through paths (S, N, 3) in any space, at the same S frames."""
+    return fit_windows(coords, len(coords), 1)[0]
+
+
+def rotations(vectors: np.ndarray) -> np.ndarray:
+    """Rotation vectors (T, 3), axis times angle in radians, as poses (T, 4, 4); Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1)[:, None, None] + 1e-12
+    x, y, z = (vectors / angle[:, 0]).T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    poses = np.tile(np.eye(4), (len(vectors), 1, 1))
+    poses[:, :3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return poses
+
+
 def bend(
     xyz: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray, space: str, window: int = 5, degree: int = 1
 ) -> np.ndarray:

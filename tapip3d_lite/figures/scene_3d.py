@@ -162,7 +162,7 @@ def _draw_tripod(ax: Axes, view: _View) -> None:
     """World axes in a corner of a panel, as long as one (or ten, a tenth, …) scene units in the middle of the view."""
     length = 10.0 ** np.floor(np.log10(0.6 * view.distance * _SIGHT))
     middle = view.eye + view.distance * view.axes[2]
-    corner = np.array([-0.8 * _WIDE, -0.72]) * _SIGHT
+    corner = np.array([-0.74 * _WIDE, -0.72]) * _SIGHT
     for name, end in zip("xyz", view.project(middle + length * np.eye(3))[0], strict=True):
         arrow = {"arrowstyle": "->", "color": INK, "shrinkA": 0, "shrinkB": 0}
         ax.annotate("", corner + end, corner, arrowprops=arrow)
