@@ -73,4 +73,6 @@ def _described(value: object) -> str:
         array = _array(value)
         small = array.size <= 9
         return np.array2string(array, precision=3, suppress_small=True) if small else f"array {array.shape}"
+    if callable(value):
+        return getattr(value, "__name__", type(value).__name__)
     return f"{value:.4g}" if isinstance(value, float) else repr(value)

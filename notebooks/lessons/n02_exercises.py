@@ -6,7 +6,8 @@ import numpy as np
 
 from lessons.checker import Exercise, Mistake
 from lessons.n01 import random_extrinsics, random_intrinsics
-from lessons.n02_pose_exercises import CROSSING, DRIFT, POSE_ERROR
+from lessons.n02_crossing_exercise import CROSSING
+from lessons.n02_pose_exercises import DRIFT, POSE_ERROR
 from lessons.n02_straightness import from_space, line_through, to_space
 from tapip3d_lite.geometry import invert, transform, unproject
 
@@ -256,4 +257,4 @@ def _uv_z(uvd: Array) -> tuple[Array, Array]:
     return uvd[..., :2], uvd[..., 2]
 
 
-EXERCISES = (REBASE, BEND, POSE_ERROR, DRIFT, CROSSING)
+EXERCISES = (REBASE, BEND, POSE_ERROR, CROSSING, DRIFT)
