@@ -2,6 +2,8 @@
 
 Each lesson's `parts(use)` names places in the library, as `"module:attribute"`, and what stands there while the
 functions are plugged in: `use("01.unproject")` gives the learner's function, or the reference while there is none.
+Where lessons meet, one may name places in `KEPT` that another one must leave to the library, as its own functions
+would not be called any more.
 Tracks are computed in double precision: the method amplifies differences of the last digit, and in single precision
 two right orders of summation could give different tracks.
 """
@@ -65,8 +67,11 @@ class plugged:
     def __init__(self, lessons: tuple[str, ...], calls: dict[str, int] | None = None) -> None:
         self.calls = {} if calls is None else calls
         self.places: dict[str, object] = {}
-        for lesson in lessons:
-            self.places |= import_module(f"lessons.n{lesson}").parts(self._use)
+        modules = [import_module(f"lessons.n{lesson}") for lesson in lessons]
+        for module in modules:
+            self.places |= module.parts(self._use)
+        for place in (place for module in modules for place in getattr(module, "KEPT", ())):
+            self.places.pop(place, None)
         self._stack = ExitStack()
 
     def _use(self, name: str) -> Callable[..., object]:
@@ -94,7 +99,7 @@ class plugged:
 
 
 def frames_and_queries(late: bool = False) -> tuple[Frames, torch.Tensor]:
-    """Frames of a clip and queries (1, N, 4) from their first half, or from all of them, in double precision."""
+    """The first frames of a clip and queries (1, N, 4) in half of them, or in all, in double precision."""
     clip = t3d.load_clip(CLIP)
     rows = clip.tracks.queries[clip.tracks.queries[:, 0] < (_FRAMES if late else _FRAMES // 2)]
     queries = torch.from_numpy(rows[:: len(rows) // _POINTS][:_POINTS]).double()[None]

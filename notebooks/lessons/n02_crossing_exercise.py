@@ -85,6 +85,11 @@ CROSSING = Exercise(
             lambda s, w, c: _around(s, w, c, 0.5),
             "the middle is a guess; on straight lines the gap shrinks in proportion, so its two ends say where it is zero.",
         ),
+        Mistake(
+            "smallest gap",
+            lambda s, w, c: s[np.argmin(np.abs(w - c))],
+            "the measured sigma with the smallest gap is near some crossing at best; find where the gap is zero.",
+        ),
         Mistake("last crossing", _last, "the curves can cross more than once; take the first."),
         Mistake(
             "start forgotten",

@@ -101,6 +101,11 @@ REBASE = Exercise(
             "the inverse of x' = R x + b is R^T (x' - b) = R^T x' - R^T b: the translation is turned back, too.",
         ),
         Mistake(
+            "transposed pose for the inverse",
+            lambda x, e, a: (transform(x, a), e @ a.swapaxes(1, 2)),
+            "only a rotation's transpose is its inverse, not that of a whole 4x4 pose.",
+        ),
+        Mistake(
             "transposed matrix",
             lambda x, e, a: (transform(x, _transposed(a)), e @ invert(a)),
             "points are rows: R acts on them as x @ R.T (plus b), not as x @ R.",
@@ -156,6 +161,11 @@ def _rays_for_depth(xyz: Array, k: Array, e: Array) -> Array:
     uvd = to_space(xyz, k, e, "uvd")
     uvd[..., 2] = np.linalg.norm(transform(xyz, e), axis=-1)
     return _rms(from_space(line_through(uvd), k, e, "uvd") - xyz)
+
+
+def _true_depth_back(xyz: Array, k: Array, e: Array) -> Array:
+    uvd = to_space(xyz, k, e, "uvd")
+    return _rms(unproject(line_through(uvd)[..., :2], uvd[..., 2], k, e) - xyz)
 
 
 BEND = Exercise(
@@ -222,6 +232,11 @@ BEND = Exercise(
             "ray length for depth",
             _rays_for_depth,
             "the third number is the depth along the viewing axis, not the length of the ray.",
+        ),
+        Mistake(
+            "true depth on the way back",
+            _true_depth_back,
+            "your pixels come from the fit, your depth from the path; the third coordinate is fitted, too.",
         ),
         Mistake(
             "line through the ends",
