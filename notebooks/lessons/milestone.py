@@ -26,21 +26,24 @@ from lessons.verdict import Verdict
 from tapip3d_lite.model.frames import Frames, frames_from_clip
 
 Use = Callable[[str], Callable[..., object]]
+Pass = Callable[[np.ndarray], np.ndarray]  # queries (N, 4) to tracks (T, N, 3)
 CLIP = Path(__file__).parents[2] / "data_samples" / "handheld.npz"
-_FRAMES, _POINTS = 16, 16
+_FRAMES, _POINTS = 16, 16  # three windows
 _METRES = 1e-3
 
 
 def milestone(*lessons: str, spaces: tuple[str | None, ...] = (None,)) -> Verdict:
     """Track a clip with the learner's functions of some lessons, e.g. `milestone("03")`, and compare with the library.
 
-    `spaces` are those to track in, None for the tracker's own.
+    `spaces` are those to track in, None for the tracker's own. Where a lesson has `BOTH_WAYS`, points are asked for in
+    all frames and tracked both ways in time.
     Passed: each function is the learner's, the tracker called each, and no point is off by a millimetre.
     """
     calls: dict[str, int] = {}
+    late = any(getattr(import_module(f"lessons.n{lesson}"), "BOTH_WAYS", False) for lesson in lessons)
     with plugged(lessons, calls):
-        mine = [_tracks(space) for space in spaces]
-    apart = max(float(np.abs(xyz - _library(space)).max()) for xyz, space in zip(mine, spaces, strict=True))
+        mine = [_tracks(space, late) for space in spaces]
+    apart = max(float(np.abs(xyz - _library(space, late)).max()) for xyz, space in zip(mine, spaces, strict=True))
     where = f", in the spaces {', '.join(map(str, spaces))}" if spaces != (None,) else ""
     lines = [f"{len(calls)} functions in the tracker; tracks of {_POINTS} points over {_FRAMES} frames{where}"]
     for name, count in calls.items():
@@ -95,10 +98,10 @@ class plugged:
         self._stack.close()
 
 
-def frames_and_queries() -> tuple[Frames, torch.Tensor]:
-    """The first frames of a clip and queries in half of them, (1, N, 4), in double precision."""
+def frames_and_queries(late: bool = False) -> tuple[Frames, torch.Tensor]:
+    """The first frames of a clip and queries (1, N, 4) in half of them, or in all, in double precision."""
     clip = t3d.load_clip(CLIP)
-    rows = clip.tracks.queries[clip.tracks.queries[:, 0] < _FRAMES // 2]
+    rows = clip.tracks.queries[clip.tracks.queries[:, 0] < (_FRAMES if late else _FRAMES // 2)]
     queries = torch.from_numpy(rows[:: len(rows) // _POINTS][:_POINTS]).double()[None]
     frames = frames_from_clip(clip).cut(0, _FRAMES)
     rgb, depths, intrinsics, poses = (
@@ -110,10 +113,24 @@ def frames_and_queries() -> tuple[Frames, torch.Tensor]:
     return Frames(rgb, depths, intrinsics, poses), queries
 
 
-def _tracks(space: str | None = None) -> np.ndarray:
+def both_ways(forward: Pass, backward: Pass, queries: np.ndarray) -> np.ndarray:
+    """Tracks (T, N, 3) joined from two passes as `model.track.track` joins them, which knows single precision only."""
+    there, turned = forward(queries), queries.copy()
+    turned[:, 0] = len(there) - 1 - turned[:, 0]
+    before = np.arange(len(there))[:, None] < queries[:, 0]
+    return np.where(before[..., None], backward(turned)[::-1], there)
+
+
+def _tracks(space: str | None = None, late: bool = False) -> np.ndarray:
     tracker = t3d.load_tracker("lite", fast=False).double()
+    frames, queries = frames_and_queries(late)
+
+    def way(frames: Frames) -> Pass:
+        return lambda rows: tracker(frames, torch.from_numpy(rows)[None], space=space)[0][0].numpy()
+
+    rows = queries[0].numpy()
     with torch.no_grad():
-        return tracker(*frames_and_queries(), space=space)[0].numpy()
+        return both_ways(way(frames), way(frames.flip()), rows) if late else way(frames)(rows)
 
 
 _library = cache(_tracks)
