@@ -52,7 +52,7 @@ def test_both_branches_train_by_the_same_functions(branch, tmp_path):
     else:  # the GPU's settings on the CPU, where bfloat16 and recorded steps are not to be had
         setting = gpu_setting(1.0, device="cpu")
         assert setting.recipe.precision == "float32" and setting.workers == 0
-        setting = small(setting, batch=2, tracker=tiny.SIZES, frames=(4, 4), iterations=(2, 2))
+        setting = small(replace(setting, workers=1), batch=2, tracker=tiny.SIZES, frames=(4, 4), iterations=(2, 2))
     paths, held_out = setting.simulate(tmp_path)
     assert len(paths) == 4 and len(held_out) == 2 and len(held_out[0]) == setting.recipe.frames[1]
     assert not ({path.stem for path in paths} & {clip.name for clip in held_out})
@@ -110,6 +110,12 @@ def test_a_run_says_what_it_shows(steps, ratio, status, word):
 )
 def test_what_a_tracker_lives_on(values, word):
     assert n06.lives_on(*(Ratio(value, value, value) for value in values)) == word
+
+
+def test_an_undecided_run_scores_no_guess():
+    assert n06.reveal("depth", "undecided", choices=("colour", "depth")).verdict.status == "shown"
+    assert n06.reveal(None, "undecided").verdict.status == "sealed"
+    assert n06.reveal("depth", "both", choices=("depth", "both")).verdict.status == "wrong"
 
 
 def solve(**functions):

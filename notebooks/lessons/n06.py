@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lessons.checker import check
-from lessons.guesses import reveal
 from lessons.milestone import milestone
 from lessons.n06_augmentations import TITLES, augmented, before_and_after, motion_paths
 from lessons.n06_chain import Chain
@@ -28,6 +27,7 @@ from lessons.n06_judge import (
     lives_on,
     memory_figure,
     ratio,
+    reveal,
     verdict,
 )
 from lessons.n06_setting import SMALL, follow, gpu_setting, judged_by, large_scene, setting, small_scene

@@ -16,6 +16,10 @@ class EncoderFreedError(RuntimeError):
     """The encoder's graph was walked before, and nothing had asked to keep it."""
 
 
+class NotDetachedError(RuntimeError):
+    """An estimate still hangs on the update before, whose graph was walked already."""
+
+
 class Chain:
     """A tracker in miniature: an "encoder", M updates that all read its features, and a loss after each.
 
@@ -36,6 +40,7 @@ class Chain:
         self.encoder, self.updater = (normal(width, width).requires_grad_() for _ in range(2))
         self.updates = updates
         self.held = self.passes = self._alive = 0
+        self._walked = False  # whether the last update was backpropagated
 
     def encode(self) -> Tensor:
         """The features; costly, in a real tracker."""
@@ -44,8 +49,10 @@ class Chain:
 
     def update(self, x: Tensor, features: Tensor) -> Tensor:
         """Correct the estimate x once."""
-        token = _Alive(self)
-        with torch.autograd.graph.saved_tensors_hooks(lambda kept: (kept.detach(), token), lambda pair: pair[0]):
+        if x.requires_grad and self._walked:
+            raise NotDetachedError("x still hangs on the update before, whose graph was walked already")
+        self._walked, token = False, _Alive(self)
+        with torch.autograd.graph.saved_tensors_hooks(lambda kept: (kept.detach(), token), _unpack):
             return x + torch.tanh((x + features) @ self.updater)
 
     def loss(self, x: Tensor, m: int) -> Tensor:
@@ -86,6 +93,11 @@ class _Encoder(torch.autograd.Function):
         return None, image.T @ (gradient * (1 - features**2)), None
 
 
+def _unpack(pair: tuple[Tensor, _Alive]) -> Tensor:
+    pair[1].chain._walked = True
+    return pair[0]
+
+
 class _Alive:
     """Lives as long as autograd keeps anything of one update."""
 
@@ -101,6 +113,7 @@ class _Alive:
 def saving(
     chain: Chain,
     leaf: bool = True,
+    collects: bool = True,
     detached: bool = True,
     keep: bool = False,
     encode: bool = False,
@@ -113,6 +126,7 @@ def saving(
     Args:
         chain: a `Chain`, or what is used like one.
         leaf: updates read a leaf, else the features themselves.
+        collects: the leaf requires a gradient.
         detached: cut the estimate off its history after each update.
         keep: retain the graph of every walk.
         encode: anew for every update.
@@ -121,7 +135,7 @@ def saving(
         hand: the leaf's gradient on to the encoder, at the end.
     """
     features, x = chain.encode(), chain.x
-    read = features.detach().requires_grad_() if leaf else features
+    read = features.detach().requires_grad_(collects) if leaf else features
     for m in range(1, chain.updates + 1):
         x = chain.update(x, chain.encode() if encode else read)
         if m == chain.updates or not last:
@@ -169,15 +183,22 @@ BACKWARD = Exercise(
             "the gradients are right, but all updates wait in memory: call backward inside the loop.",
         ),
         Mistake(
-            "not detached, graph retained",
-            _slipped(detached=False, keep=True),
-            "an update's loss must not reach back into the update before: `x = x.detach()` after each. Retaining the "
-            "graph only makes the walk possible that should not happen.",
+            "walked at the end, not detached",
+            lambda chain: plain(chain, detached=False),
+            "an update's loss must not reach back into the update before: `x = x.detach()` after each; and call backward "
+            "inside the loop.",
         ),
         Mistake(
             "not detached",
             _slipped(detached=False),
-            "x still hangs on the update before, whose graph is gone by now: `x = x.detach()` at the end of the loop.",
+            "x still hangs on the update before: `x = x.detach()` at the end of the loop. (`retain_graph` would only make "
+            "the walk possible that should not happen.)",
+        ),
+        Mistake(
+            "leaf without gradient",
+            _slipped(collects=False),
+            "leaf.grad is empty: the leaf must require a gradient, `features.detach().requires_grad_()`, and backward "
+            "must have been called before you read it.",
         ),
         Mistake(
             "encoder walked by every update",

@@ -88,6 +88,8 @@ def _loss(
         return position[counts & visible].mean() + entropy[counts].mean()
     if slip.get("all"):
         return (position + entropy).mean()
+    if slip.get("means"):
+        return distance[counts].mean() / depth[counts].mean() + entropy[counts].mean()
     total = (position + entropy)[counts]
     return total.sum() if slip.get("sum") else total.mean()
 
@@ -112,8 +114,8 @@ def _update(rng: np.random.Generator, size: int) -> tuple[Tensor, ...]:
     for pose in extrinsics:
         pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         pose[:3, :3] *= np.linalg.det(pose[:3, :3])
-        pose[:3, 3] = rng.uniform(-1, 1, 2).tolist() + [rng.uniform(3, 5)]
-    truth = rng.uniform(-1, 1, (frames, tracks, 3)) + [0, 0, 0.5]
+        pose[:3, 3] = rng.uniform(-1, 1, 2).tolist() + [rng.uniform(4, 6)]
+    truth = rng.uniform(-1.6, 1.6, (frames, tracks, 3)) + [0, 0, 0.5]
     counts = rng.random((frames, tracks)) < 0.6
     visible = rng.random(counts.shape) < 0.6
     counts[0, 0], counts[-1, -1] = True, False
@@ -198,6 +200,11 @@ LOSS = Exercise(
             "positions of visible points only",
             _slipped(visible_only=True),
             "hidden points count too: the tracker must say where a point is while it cannot see it.",
+        ),
+        Mistake(
+            "means divided by each other",
+            _slipped(means=True),
+            "divide each distance by its own point's depth, then take the mean; you divided one mean by the other.",
         ),
         Mistake(
             "no gradient to the estimate",

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from matplotlib.figure import Figure
 
+from lessons.guesses import SHOW, Revealed
+from lessons.guesses import reveal as reveal_known
 from lessons.verdict import Verdict
 from tapip3d_lite.clip import Clip, Tracks
 
@@ -83,6 +85,12 @@ def verdict(steps: int, enough: int, result: Ratio) -> Verdict:
         more = f"about {enough} are needed. The time was short or the machine busy: set MINUTES higher, and run again."
         return Verdict("not attempted", f"undecided: {facts}; {more} Until then nothing below is shown, nor refuted.")
     return Verdict("wrong", f"not learnt: {facts}, although {enough} steps should do.")
+
+
+def reveal(guess: float | str | None, truth: float | str, **options: object) -> Revealed:
+    """As `guesses.reveal`; a guess about what could not be decided is not scored."""
+    undecided = truth == "undecided" and guess is not None
+    return reveal_known(SHOW if undecided else guess, truth, **options)
 
 
 def lives_on(live: Ratio, without_colour: Ratio, without_depth: Ratio) -> str:

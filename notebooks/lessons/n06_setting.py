@@ -111,7 +111,7 @@ def cpu_setting(minutes: float) -> Setting:
     """A small tracker, clips as many as it can use, positions in pixels."""
     recipe = TrainConfig(
         tracker=SMALL,
-        clips=max(16, round(50 * minutes)),
+        clips=max(16, round(60 * minutes)),
         frames=8,  # one window
         iterations=2,
         lr=1.5e-3,
@@ -133,9 +133,9 @@ def gpu_setting(minutes: float, device: str = "cuda") -> Setting:
     gpu = torch.device(device).type == "cuda"
     recipe = TrainConfig(
         clips=max(64, round(80 * minutes)),
-        batch=16,
+        batch=8,
         frames=(8, 16),
-        iterations=(2, 3),
+        iterations=3,  # one number: each pair of frames and updates is recorded anew, and keeps a step's memory
         train_encoder=True,
         lr=1e-3,
         motion=MotionConfig(world=1.0, turned=0.0),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import re
 
 from IPython.display import display
 from matplotlib.figure import Figure
@@ -98,11 +99,13 @@ def pipeline(lesson: str) -> Shown:
             number,
             ha="center",
             va="center",
-            fontsize=7.5,
+            fontsize=8,
             color="#57606a",
             zorder=3,
         )
-    words = ", ".join(" ".join(name.replace("$", "").replace("\\mathcal{C}^l", "C").split()) for name in lit)
+    words = "; ".join(
+        re.sub(r"\n(.*)", r" (\1)", re.sub(r"\$(?:\\mathcal\{)?(\w)[^$]*\$", r"\1", name)) for name in lit
+    )
     alt = (
         "The method from left to right: frames with depth and cameras; encoder and lifting side by side; world space; "
     )
