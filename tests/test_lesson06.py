@@ -167,6 +167,6 @@ def test_the_whole_path_is_the_learners(tmp_path):
     shutil.copytree(Path(tiny.ROOT) / "data_samples", tmp_path / "data_samples")
     said = n06.collect(tmp_path, lessons)
     assert said.status == "passed", str(said)
-    tracked = n06.milestone(*lessons[1:])
+    tracked = n06.milestone(*lessons[1:], spaces=("world", "camera"))
     assert tracked.status == "passed", str(tracked)
     assert "the reference" not in str(tracked)

@@ -49,7 +49,7 @@ def test_flying_cells_are_counted_and_marked_by_form():
     assert "4 of 9" in ax.get_title() and "0 of 9" in other.get_title()
     assert [len(part.get_offsets()) for part in ax.collections[1:]] == [5, 4]
     scene = n01.cells_in_space(surface, cells, fly)
-    assert [trace.marker.symbol for trace in scene.figure.data] == ["circle", "circle", "x"]
+    assert [trace.marker.symbol for trace in scene.figure.data] == ["circle", "circle", "diamond"]
     assert len(scene.figure.data[2].x) == 4 and len(scene.twin.axes[0].collections) == 3
 
 

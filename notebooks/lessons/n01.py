@@ -57,6 +57,9 @@ __all__ = [
 EXERCISES = CAMERA_EXERCISES + CELL_EXERCISES
 
 
+KEPT = ("tapip3d_lite.model.spaces:Space.lift",)  # lesson 02 lifts into the world without this lesson's `to_world`
+
+
 def parts(use: Callable[[str], Callable[..., object]]) -> dict[str, object]:
     """Where the lesson's functions stand in the tracker: all that it knows of a scene goes through them."""
     lift, to_world = use("01.unproject"), use("01.to_world")

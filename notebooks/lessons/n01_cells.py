@@ -67,6 +67,16 @@ NEAREST = Exercise(
             "(i + 1/2) n / m is counted from the image's edge, which lies at -1/2; as a pixel coordinate it is half less.",
         ),
         Mistake(
+            "rounded down",
+            lambda n, m: np.floor(_middles(n, m) - 0.5).astype(int),
+            "the middle is right, but rounding down takes the pixel before it, even where the next one is nearer.",
+        ),
+        Mistake(
+            "rounded twice",
+            lambda n, m: np.arange(m) * n // m + n // m // 2,
+            "half a cell was added to an edge that was rounded before; round once, at the end.",
+        ),
+        Mistake(
             "whole steps",
             lambda n, m: np.arange(m) * (n // m) + n // m // 2,
             "whole steps of n // m pixels lag behind where the sizes do not divide each other.",
@@ -224,6 +234,11 @@ CLOUD = Exercise(
             "odd row kept",
             _halving(lambda maps: F.avg_pool2d(maps, 2, ceil_mode=True)),
             "an odd last row or column has no partner and is left out: 5 cells become 2.",
+        ),
+        Mistake(
+            "coarsest first",
+            lambda *case: cloud(*case)[::-1],
+            "the finest level comes first.",
         ),
         Mistake(
             "channels first",

@@ -66,6 +66,16 @@ UNPROJECT = Exercise(
             "you are half a pixel off: here pixel centres are whole numbers, so nothing is added to u and v.",
         ),
         Mistake(
+            "half a pixel taken off",
+            lambda uv, z, k: unproject(uv - 0.5, z, k),
+            "you took half a pixel off: here pixel centres are whole numbers already, so u and v go in as they are.",
+        ),
+        Mistake(
+            "divided by depth",
+            lambda uv, z, k: _rays(uv, k) / z[..., None],
+            "projecting divides by the depth; lifting is the way back and multiplies by it.",
+        ),
+        Mistake(
             "transposed matrix",
             lambda uv, z, k: z[..., None] * (_homogeneous(uv) @ np.linalg.inv(k)),
             "K^-1 acts on column vectors; for rows of pixels multiply by its transpose from the right.",

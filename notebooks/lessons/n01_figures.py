@@ -126,7 +126,7 @@ def cells_in_space(surface: Array, cells: Array, fly: Array) -> show_3d:
     groups = [("true surface", surface, GREY, "circle", "o", 1.0)]
     groups += [
         ("cell on a surface", cells[~fly], BLUE, "circle", "o", 3),
-        ("flying cell", cells[fly], RED, "x", "x", 4),
+        ("flying cell", cells[fly], RED, "diamond", "D", 4),
     ]
     near = NEAR * np.median(surface[:, 2])
     scene, twin = go.Figure(), Figure(figsize=(6.4, 4.4), layout="constrained")

@@ -166,6 +166,11 @@ BOTH_WAYS = Exercise(
             _slipped("normed stream"),
             "the norm only stands before the attention: add what was found to x itself, not to norm(x).",
         ),
+        Mistake(
+            "other bag cut off",
+            lambda s, c, a, b: (_one_way(s, c.detach(), a), _one_way(c, s.detach(), b)),
+            "gradients flow to those who are seen, too: do not detach the other bag.",
+        ),
     ),
 )
 

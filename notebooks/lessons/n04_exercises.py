@@ -14,18 +14,6 @@ from lessons.n04_cost import COST
 from tapip3d_lite.model.blocks import DEGREES
 
 
-def fourier_features(x: np.ndarray, degrees: tuple[int, ...] = DEGREES) -> np.ndarray:
-    """Numbers (..., d) to (..., 33 d) in NumPy: [x | sin(2^i x) | cos(2^i x)], degree by degree."""
-    angles = np.concatenate([2.0**i * x for i in degrees], -1)
-    return np.concatenate([x, np.sin(angles), np.cos(angles)], -1)
-
-
-def softmax(scores: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Exponentials in NumPy that sum to one along an axis."""
-    powers = np.exp(scores - scores.max(axis, keepdims=True))
-    return powers / powers.sum(axis, keepdims=True)
-
-
 def waves(x: Tensor, degrees: tuple[int, ...] = DEGREES) -> Tensor:
     """Numbers (..., d) to (..., 33 d): [x | sin(2^i x) | cos(2^i x)], degree by degree."""
     angles = _angles(x, degrees)

@@ -111,7 +111,7 @@ def cpu_setting(minutes: float) -> Setting:
     """A small tracker, clips as many as it can use, positions in pixels."""
     recipe = TrainConfig(
         tracker=SMALL,
-        clips=max(16, round(50 * minutes)),
+        clips=max(16, round(60 * minutes)),
         frames=8,  # one window
         iterations=2,
         lr=1.5e-3,
