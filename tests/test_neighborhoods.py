@@ -205,15 +205,27 @@ def test_slots_without_valid_cells_are_filled():
     np.testing.assert_array_equal(stand_ins(np.array([0, 1, 2, 3]), np.zeros(4, bool)), [0, 1, 2, 3])
 
 
-def test_a_lens_is_read_off_a_map_even_a_normalised_one():
-    depth = np.random.default_rng(0).uniform(2, 5, (12, 16))
+def test_a_camera_is_read_off_a_map_in_any_space_of_true_distances():
+    rng = np.random.default_rng(0)
     intrinsics = np.array([[20.0, 0, 7.3], [0, 18, 5.9], [0, 0, 1]])
-    points, place = point_map(depth, intrinsics), np.array([0.3, -0.2, -1.5])
-    found, at = lens(points / 2 + place)
-    np.testing.assert_allclose(found, intrinsics, atol=1e-8)
-    np.testing.assert_allclose(at, place, atol=1e-8)
-    turned = points @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    assert lens(turned) is None and lens(point_map(np.full((4, 5), 2.0), intrinsics)) is None
+    points = point_map(rng.uniform(2, 5, (12, 16)), intrinsics)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    for scale, turned, place in ((1.0, np.eye(3), np.zeros(3)), (0.5, turn, np.array([0.3, -0.2, -1.5]))):
+        found, rotation, at = lens(scale * points @ turned + place)
+        np.testing.assert_allclose(found, intrinsics, atol=1e-6)
+        np.testing.assert_allclose(rotation, turned, atol=1e-6)
+        np.testing.assert_allclose(at, place, atol=1e-6)
+    v, u = np.indices((12, 16))
+    others = (
+        points * [1, 1, 3],
+        points * [-1, 1, 1],
+        np.stack([u, v, points[..., 2]], -1),
+        point_map(np.full((12, 16), 2.0), intrinsics),
+    )
+    assert lens(others[0]) is not None  # other focal lengths would do
+    assert all(lens(x) is None for x in others[1:])
+    assert lens(points @ np.array([[1, 0.3, 0], [0, 1, 0], [0, 0, 1]]).T) is None  # a skewed camera
 
 
 def test_argpartition_and_unstable_sorts_are_rejected():
@@ -257,20 +269,21 @@ def test_cells_are_counted_however_they_are_read():
         assert cells_visited(all_of_them, case) == case[1].size / 3 >= wanted
 
 
-def test_two_visits_find_the_exact_neighbours():
+def test_the_exact_search_finds_the_exact_neighbours():
     rng = np.random.default_rng(1)
     intrinsics = np.array([[20.0, 0, 8], [0, 18, 7], [0, 0, 1]])
-    visits = set()
-    for _ in range(60):
-        depth = rng.choice([1.0, 2.0, 6.0], (15, 17)) + rng.uniform(0, 0.4, (15, 17))
-        points, (row, column) = point_map(depth, intrinsics), rng.integers(0, (15, 17))
-        query = points[row, column] * rng.uniform(0.6, 1.5)
-        found, cells, times = exact_search(query, points, intrinsics, 9, search, walls)
-        distance = np.linalg.norm(points - query, axis=-1).ravel()
-        assert list(found) == list(np.argsort(distance, kind="stable")[:9])
-        assert 9 <= cells <= 2 * points.size / 3
-        visits.add(times)
-    assert visits == {1, 2}
+    radii = set()
+    for count in (1, 7, 9):
+        for _ in range(30):
+            depth = rng.choice([1.0, 2.0, 6.0], (15, 17)) + rng.uniform(0, 0.4, (15, 17))
+            points, (row, column) = point_map(depth, intrinsics), rng.integers(0, (15, 17))
+            query = points[row, column] * rng.uniform(0.6, 1.5)
+            found, cells, radius = exact_search(query, points, intrinsics, count, search, walls, window)
+            distance = np.linalg.norm(points - query, axis=-1).ravel()
+            assert list(found) == list(np.argsort(distance, kind="stable")[:count])
+            assert count < cells <= 25 + points.size / 3
+            radii.add(radius)
+    assert min(radii) <= 2 and max(radii) >= 8
 
 
 def test_share_curves_are_means_over_clips_that_have_any():

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lessons.n02_straightness import SPACES, to_space
+from lessons.n02_straightness import SPACES
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.geometry import transform
 
 _FALL = -9.81  # m/s², upwards
-_UP = {"world": (2, 1), "camera": (1, -1)}  # axis and sign of "up"
 
 
 def ratio(values: Mapping[str, np.ndarray], space: str = "camera", draws: int = 2000, seed: int = 0) -> np.ndarray:
@@ -36,11 +36,21 @@ def print_table(title: str, table: Mapping[str, Mapping[str, np.ndarray]], with_
     print()
 
 
+def heights(xyz: np.ndarray, extrinsics: np.ndarray, space: str) -> np.ndarray:
+    """Heights (T, N) of world points (T, N, 3) in the coordinates of "world", or in those of "camera".
+
+    A camera may look down, so its up is not -y: it is the mean over frames of the world's up, seen from the camera.
+    """
+    if space == "world":
+        return xyz[..., 2]
+    up = extrinsics[:, :3, 2].mean(0)
+    return transform(xyz, extrinsics) @ (up / np.linalg.norm(up))
+
+
 def accelerations(clip: Clip, space: str) -> np.ndarray:
     """Upward accelerations in m/s² of a clip's moving points in "world" or "camera", from second differences."""
-    axis, sign = _UP[space]
-    coords = to_space(clip.tracks.xyz[:, clip.tracks.dynamic], clip.intrinsics, clip.extrinsics, space)
-    return sign * np.diff(coords[..., axis], n=2, axis=0).ravel() * clip.fps**2
+    points, poses = clip.tracks.xyz[:, clip.tracks.dynamic].astype(float), clip.extrinsics.astype(float)
+    return np.diff(heights(points, poses, space), n=2, axis=0).ravel() * clip.fps**2
 
 
 def peak(groups: list[np.ndarray], draws: int = 1000, seed: int = 0) -> np.ndarray:

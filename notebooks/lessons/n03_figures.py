@@ -66,7 +66,7 @@ def neighborhoods_3d(
     objects: np.ndarray,
     track: int,
     frame: int = 0,
-    counts: Sequence[int] = (1, 4, 9, 16, 32),
+    counts: Sequence[int] = (1, 4, 9, 16, 25, 32),
     first: int = 16,
 ) -> go.Figure:
     """Both neighbourhoods of a true point in space, to be turned, with a slider over K; camera coordinates, metres.

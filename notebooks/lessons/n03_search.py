@@ -23,43 +23,44 @@ def exact_search(
     count: int,
     search: Answer,
     walls: Answer,
-    radius: int = 2,
+    window: Answer,
 ) -> tuple[np.ndarray, int, int]:
-    """Exact nearest neighbours by at most two visits: the second is as wide as the first shows to be enough.
+    """Exact nearest neighbours: a small window says how far they are at most, the walls how wide to search.
 
-    The last cell found by the first visit is an upper bound, since more cells can only bring nearer ones. So a window
-    whose walls are all farther than that holds every neighbour.
+    More cells can only bring nearer ones, so the K-th distance in a window of at least K cells is an upper bound. A
+    window whose walls are all farther than that holds every neighbour, and the search in it proves itself.
 
     Args:
         query: (3,), camera frame; its pixel lies in the image.
-        points: (H, W, 3), camera frame, one for each pixel.
+        points: (H, W, 3), camera frame, one for each pixel; at least as many rows and columns as the small window has.
         intrinsics: (3, 3).
         count: K.
         search: as `03.proof`.
         walls: as `03.walls`.
-        radius: of the first visit, at least; wider where a window in the image's corner would hold too few cells.
+        window: as `03.window`.
 
     Returns:
-        Indices (K,) into the H * W cells, nearest first; how many cells were visited; how many visits it took.
+        Indices (K,) into the H * W cells, nearest first; how many cells were visited; the radius that was enough.
     """
-    radius, size = max(radius, math.ceil(count**0.5) - 1), np.array(points.shape[1::-1])
-    pixel = np.floor(project(query[None], intrinsics)[0][0] + 0.5).astype(int)
-
-    def visited() -> int:
-        return int(np.prod(np.minimum(pixel + radius, size - 1) - np.maximum(pixel - radius, 0) + 1))
-
-    found, margin = search(query, points, intrinsics, count, radius)
-    cells, hair = visited(), 1e-5  # the library computes in single precision
-    if margin > hair:
-        return found, cells, 1
-    last = np.linalg.norm(points.reshape(-1, 3)[found[-1]] - query)
+    # Twice as many cells as are wanted, and more: at a silhouette half of them may be far away.
+    size, side = np.array(points.shape[1::-1]), 2 * math.ceil(count**0.5) - 1
+    hair = 1e-5  # the library computes in single precision
+    uv = project(query[None], intrinsics)[0][0]
+    # Moved inside, where no cell is repeated.
+    small = window(np.clip(uv, side / 2 - 0.5, size - side / 2 - 0.5), side, points.shape[:2])
+    most = np.sort(np.linalg.norm(points.reshape(-1, 3)[small] - query, axis=-1))[count - 1] + hair
+    pixel, radius = np.floor(uv + 0.5).astype(int), 1
     while True:
-        radius += 1
         box = np.concatenate([pixel - radius - 1, pixel + radius + 1])
         outside = np.concatenate([box[:2] >= 0, box[2:] < size])  # sides on which cells are left unvisited
-        if walls(query, intrinsics, box)[outside].min(initial=np.inf) > last + hair:
+        if walls(query, intrinsics, box)[outside].min(initial=np.inf) > most:
             break
-    return search(query, points, intrinsics, count, radius)[0], cells + visited(), 2
+        radius += 1
+    found, margin = search(query, points, intrinsics, count, radius)
+    if margin < 0:
+        raise AssertionError(f"a window of radius {radius} was to hold all neighbours, but its margin is {margin:.4g}")
+    cells = np.prod(np.minimum(pixel + radius, size - 1) - np.maximum(pixel - radius, 0) + 1)
+    return found, len(small) + int(cells), radius
 
 
 def filled(indices: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -76,31 +77,48 @@ def stand_ins(window: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(valid[window], window, window[good[0]]) if len(good) else window
 
 
-def lens(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Intrinsics (3, 3), in cells, and place (3,) of the camera that saw a map (h, w, 3); None if its axes are others.
+def lens(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The camera that saw a map (h, w, 3), from the map alone; None if distances there are not those of space.
 
-    The tracker's normalisation moves camera coordinates and divides them by one number, so that cells still lie on
-    rays, but through another place o. Column u says fx (x - ox) = (u - cx) (z - oz): linear in fx, cx, oz and the rest.
+    A camera is a matrix of 3 x 4 that takes each point, with a 1, to a multiple of its pixel, with a 1: linear equations.
+    The tracker's normalisation only moves a space and divides it by one number, which changes no angle.
+
+    Returns:
+        Intrinsics (3, 3) in units of cells; rotation (3, 3); place (3,) of the camera: rotation @ (p - place) is seen.
     """
-    v, u = (grid.ravel().astype(float) for grid in np.indices(points.shape[:2]))
-    x, y, z = points.reshape(-1, 3).T
-    none, one = np.zeros_like(z), np.ones_like(z)
-    rows = [[x, z, one, none, none, none, u], [none, none, none, y, z, one, v]]
-    system = np.concatenate([np.stack(row, -1) for row in rows])
-    wanted = np.concatenate([u * z, v * z])
-    found, _, rank, _ = np.linalg.lstsq(system, wanted, rcond=None)
-    fx, cx, ex, fy, cy, ey, oz = found
-    if rank < 7 or fx <= 0 or fy <= 0 or np.abs(system @ found - wanted).max() > 1e-4 * np.abs(wanted).max():
+    height, width = points.shape[:2]
+    v, u = (grid.ravel().astype(float) for grid in np.indices((height, width)))
+    flat = points.reshape(-1, 3).astype(float)
+    middle, spread = flat.mean(0), max(float(flat.std()), 1e-9)
+    known = np.concatenate([(flat - middle) / spread, np.ones((len(flat), 1))], -1)  # (P, 4)
+    pixels = np.array([[width, 0, width / 2], [0, height, height / 2], [0, 0, 1]])  # from about 1 in size
+    a, b = (u - width / 2) / width, (v - height / 2) / height
+    zero = np.zeros_like(known)
+    rows = [[known, zero, -a[:, None] * known], [zero, known, -b[:, None] * known]]
+    system = np.concatenate([np.concatenate(row, -1) for row in rows])  # (2 P, 12)
+    values, vectors = np.linalg.eigh(system.T @ system / len(flat))
+    if values[1] < 1e-7 or values[0] > 1e-10:
+        return None  # many cameras would do, as for a plane, or none
+    matrix = pixels @ vectors[:, 0].reshape(3, 4)
+    matrix *= np.sign((known @ matrix[2]).mean())
+    # A = K R with K upper triangular: the QR decomposition of A turned over.
+    turned, upper = np.linalg.qr(matrix[::-1, :3].T)
+    intrinsics, rotation = upper.T[::-1, ::-1], turned.T[::-1]
+    signs = np.sign(np.diag(intrinsics))
+    intrinsics, rotation = intrinsics * signs / (intrinsics[2, 2] * signs[2]), signs[:, None] * rotation
+    place = middle - spread * np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    if abs(intrinsics[0, 1]) > 1e-4 * intrinsics[0, 0] or np.linalg.det(rotation) < 0:
         return None
-    place = np.array([-(ex + cx * oz) / fx, -(ey + cy * oz) / fy, oz])
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), place
+    seen = (flat - place) @ rotation.T
+    uv, _ = project(seen, intrinsics)
+    return (intrinsics, rotation, place) if np.abs(uv - np.stack([u, v], -1)).max() < 1e-3 else None
 
 
 def parts(use: Use) -> dict[str, object]:
     """The learner's searches as the tracker's k-NN, and the learner's window as its neighbourhood in the image.
 
     k-NN over all cells finds the support of the queries. The context of estimates is found by the search that proves
-    itself where the space is the camera's, all depths are known and the estimate lies in the image, else by k-NN, too.
+    itself where all depths are known, a camera fits and the estimate lies in the image, else by k-NN, too.
     """
     nearest, window, walls, search = (use(f"03.{name}") for name in ("knn", "window", "walls", "proof"))
 
@@ -110,13 +128,13 @@ def parts(use: Use) -> dict[str, object]:
         camera = lens(points) if prove and valid.all() else None
         if camera is None:
             return filled(nearest(queries.astype(np.float32), flat, count, known), known)
-        intrinsics, place = camera
-        found = []
+        intrinsics, rotation, place = camera
+        seen, found = (points - place) @ rotation.T, []
         for query in queries:
-            seen = query - place
-            inside = seen[2] > 0 and (np.abs(2 * project(seen[None], intrinsics)[0][0] + 1 - size) < size).all()
+            turned = rotation @ (query - place)
+            inside = turned[2] > 0 and (np.abs(2 * project(turned[None], intrinsics)[0][0] + 1 - size) < size).all()
             if inside:
-                found.append(exact_search(seen, points - place, intrinsics, count, search, walls)[0])
+                found.append(exact_search(turned, seen, intrinsics, count, search, walls, window)[0])
             else:
                 found.append(nearest(query[None].astype(np.float32), flat, count, known)[0])
         return np.stack(found)

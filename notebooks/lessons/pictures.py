@@ -92,7 +92,7 @@ def pipeline(lesson: str) -> Shown:
         on = number == lesson
         ax.add_patch(FancyBboxPatch((x - 0.42, y - 0.22), 0.84, 0.44, boxstyle="round,pad=0.02,rounding_size=0.08",
                                     fc=_LIT if on else _PALE, ec=_INK, lw=1.6 if on else 0.6, zorder=2))  # fmt: skip
-        ax.text(x, y, name, ha="center", va="center", fontsize=8.5, color=_INK, zorder=3, weight="bold" if on else None)
+        ax.text(x, y, name, ha="center", va="center", fontsize=8.5, color=_INK, zorder=3)
         ax.text(
             x + 0.4 if y > 1.2 else x,
             y - 0.38,
