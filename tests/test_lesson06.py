@@ -61,7 +61,7 @@ def test_both_branches_train_by_the_same_functions(branch, tmp_path):
     assert [line["stage"] for line in lines] == ["matching", "tracking", "tracking"]
     assert {"val_APD3D_none", "val_APD3D_none_dynamic"} <= lines[-1].keys()
     other = setting.trainer(tmp_path / "short", paths, loss=LossConfig(form="paper"))
-    assert asyncio.run(n06.train_unseen(other)) == 3
+    assert asyncio.run(n06.train_unseen(other)) == 2
     pred = n06.follow(other.tracker.eval(), held_out[0])
     assert pred.xyz.shape == held_out[0].tracks.xyz.shape
 

@@ -218,14 +218,16 @@ async def train_live(
 
 
 async def train_unseen(trainer: Trainer) -> int:
-    """Train to the end without showing how it goes, since a guess is sealed; returns the number of steps.
+    """Train to the end without showing how it goes, since a guess is sealed; returns the number of steps of tracking.
 
     Stop by "Kernel, Interrupt": the training then ends where it is.
     """
     with interruptible() as interrupted:
-        for _ in trainer.steps(interrupted):
+        count = 0
+        for line in trainer.steps(interrupted):
+            count += line["stage"] == "tracking"
             await asyncio.sleep(0)
-    return trainer.step
+    return count
 
 
 def _moves(ax: Axes, clip: Clip, tracks: Tracks, t: int, truth: Tracks | None) -> None:

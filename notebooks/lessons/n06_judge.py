@@ -74,11 +74,11 @@ def verdict(steps: int, enough: int, result: Ratio) -> Verdict:
     """What a training shows: learnt, not learnt, or undecided, because it made too few steps to learn at all.
 
     Args:
-        steps: that it made.
+        steps: of tracking that it made.
         enough: that it needs.
         result: its error over zero motion's.
     """
-    facts = f"{steps} steps, error of moving points {result} of zero motion's"
+    facts = f"{steps} steps of tracking, error of moving points {result} of zero motion's"
     if result.below(1.0):
         return Verdict("passed", f"learnt: {facts}; the whole interval lies below 1.")
     if steps < enough:

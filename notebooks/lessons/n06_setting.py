@@ -54,8 +54,8 @@ class Setting:
         training: gives the training clip of a seed; at a module's top level, for worker processes.
         scene: the same of the held-out clips.
         held_out: how many clips to judge by; their first `recipe.frames` frames.
-        enough: steps of the long training, and
-        enough_short: of a short one, that a claim about it needs.
+        enough: steps of tracking that a claim about the long training needs, and
+        enough_short: one about a short training.
         workers: processes that make examples ahead of time.
     """
 
@@ -111,7 +111,7 @@ def cpu_setting(minutes: float) -> Setting:
     """A small tracker, clips as many as it can use, positions in pixels."""
     recipe = TrainConfig(
         tracker=SMALL,
-        clips=max(16, round(60 * minutes)),
+        clips=max(16, round(40 * minutes)),
         frames=8,  # one window
         iterations=2,
         lr=1.5e-3,
@@ -125,7 +125,7 @@ def cpu_setting(minutes: float) -> Setting:
         evaluate_every=115,
         save_every=500,
     )
-    return Setting("cpu", recipe, small_scene, small_scene, held_out=24, enough=1200, enough_short=500, workers=0)
+    return Setting("cpu", recipe, small_scene, small_scene, held_out=24, enough=700, enough_short=500, workers=0)
 
 
 def gpu_setting(minutes: float, device: str = "cuda") -> Setting:
