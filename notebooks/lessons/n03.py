@@ -50,6 +50,3 @@ __all__ = [
     "track_objects",
     "two_neighborhoods",
 ]
-
-
-BESIDE = ("03.window",)  # the neighbourhood of other systems; the paper's path looks around in 3D
