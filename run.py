@@ -13,6 +13,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import venv
 from pathlib import Path
 
@@ -103,16 +104,30 @@ def run_test(*arguments: str) -> int:
         arguments = tuple(a for a in arguments if a != "--browser")
     if arguments:
         return _call("-m", "pytest", *arguments)
-    unit = _call("-m", "pytest", "tests")
-    notebooks = _call("-m", "pytest", "--nbval-lax", "--nbval-cell-timeout=300", "-p", "no:cacheprovider", "notebooks")
-    return unit or notebooks
+    # Side by side, each on its share of the cores: two programs that want all of them get in one another's way.
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // 2)))
+    every = "-m", "pytest", "--nbval-lax", "--nbval-cell-timeout=600", "-p", "no:cacheprovider", "notebooks"
+    with tempfile.TemporaryFile() as report:
+        notebooks = subprocess.Popen(**_python(*every), stdout=report, stderr=subprocess.STDOUT)
+        try:
+            unit = _call("-m", "pytest", "tests")
+            notebooks.wait()
+        finally:
+            notebooks.kill()  # where the unit tests were interrupted
+        report.seek(0)
+        print(report.read().decode(errors="replace"), flush=True)
+    return unit or notebooks.returncode
 
 
 def _call(*arguments: object) -> int:
-    """Run Python in this folder, where it also finds the notebooks' `lessons`."""
+    return subprocess.run(**_python(*arguments)).returncode
+
+
+def _python(*arguments: object) -> dict[str, object]:
+    """How to run Python in this folder, where it also finds the notebooks' `lessons`."""
     places = [str(ROOT / "notebooks"), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(places)}
-    return subprocess.run([PYTHON, *map(str, arguments)], cwd=ROOT, env=environment).returncode
+    return {"args": [PYTHON, *map(str, arguments)], "cwd": ROOT, "env": environment}
 
 
 def _root_user() -> list[str]:

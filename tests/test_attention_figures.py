@@ -10,9 +10,21 @@ from lessons.n04 import (
     WAYS,
     AttentionPair,
     cell_centers,
+    clear_and_fast,
+    cloud_of,
+    coin,
+    cost_curves,
     entropy,
+    floors,
     fourier_waves,
+    hits,
+    last_updates,
+    metres_per_unit,
+    paint,
+    paired_bags,
+    partner_attention,
     rates,
+    tiles,
     two_bags,
     who_looks_where,
 )
@@ -143,3 +155,60 @@ def test_rates_draw_means_and_intervals():
     low, high = (c.get_ydata() for c in first.lines[1])
     np.testing.assert_allclose(high - low, 2 * 1.96 * y.std(0, ddof=1) / 3**0.5)
     assert [ax.get_title() for ax in figure.axes] == ["a", "b"] and not figure.axes[0].containers[1].lines[1]
+
+
+def test_curves_differ_by_more_than_their_colour():
+    y = np.array([[0.2, 0.4], [0.4, 0.8]])
+    drawn = rates({"a": {name: ([4, 8], y) for name in "pqrst"}}, "K", "share").axes[0].containers
+    assert len({container.lines[0].get_marker() for container in drawn}) == 5
+
+
+def test_costs_are_drawn_with_a_legend_of_colours_and_one_of_line_styles():
+    cost = {d: clear_and_fast([2, 4], d, rounds=1) for d in (8, 16)}
+    assert all(time > 0 and count > 0 for table in cost.values() for time, count in table.values())
+    assert cost[8][4, "clear"][1] > cost[8][4, "fast"][1] > cost[8][2, "fast"][1]
+    figure = cost_curves(cost)
+    arithmetic, clock = figure.axes
+    np.testing.assert_allclose(arithmetic.lines[1].get_ydata(), [cost[8][k, "fast"][1] / 1e6 for k in (2, 4)])
+    np.testing.assert_allclose(clock.lines[2].get_ydata(), [cost[16][k, "clear"][0] for k in (2, 4)])
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert words == ["D = 8", "D = 16", "clear form", "fast form"]
+    solid, dashed = figure.legends[0].get_lines()[2:]
+    assert (solid.get_linestyle(), dashed.get_linestyle()) == ("-", "--")
+
+
+def test_floors_show_the_paint_of_each_cell(clip):
+    level = cloud_of(clip)
+    figure = floors(level, {"own": lambda p: p, "coin": coin}, frame=2)
+    own, tiled = (np.asarray(ax.images[0].get_array()) for ax in figure.axes)
+    assert own.shape == (*level.points.shape[2:4], 3) and own.std() > 0.1
+    known = level.valid[0, 2].numpy()
+    np.testing.assert_array_equal(tiled[known][:, 0], coin(level.points[0, 2]).numpy()[known][:, 0])
+    same = (tiles(level.points[0, 2])[:, 1:] == tiles(level.points[0, 2])[:, :-1]).all(-1).numpy()
+    assert (tiled[:, 1:, 0] == tiled[:, :-1, 0])[same & known[:, 1:] & known[:, :-1]].all()
+
+
+def test_a_point_with_its_own_colour_is_found_and_one_without_features_is_not(clip):
+    level = cloud_of(clip)
+    shares = {}
+    for name, colors in {"own": level.points, "grey": torch.zeros_like(level.points)}.items():
+        rng = np.random.default_rng(0)
+        shares[name] = hits(paired_bags(clip, paint(level, colors), 8, rng, moving=False), rng)
+    assert shares["own"]["P2N"] > 0.7 > 0.5 > shares["grey"]["P2N"]
+    assert shares["own"]["shape alone"] == shares["grey"]["shape alone"]
+
+
+def test_partners_are_found_around_the_true_point(clip, queries):
+    steps, _ = record(clip, queries[:4])
+    ends = last_updates(steps)
+    assert [step.start for step in ends] == sorted({step.start for step in steps})
+    assert all(metres_per_unit(step) == pytest.approx(metres_per_unit(ends[0]), rel=0.5) for step in ends)
+    seen = np.flatnonzero(clip.tracks.visible[0])[:4]
+    trained, alike = partner_attention(steps, clip, seen)
+    assert trained.shape == alike.shape == (4,)
+    assert ((trained[np.isfinite(trained)] >= 0) & (trained[np.isfinite(trained)] <= K)).all()
+    # Attention that rests on the partner alone gives K times chance; spread evenly, chance.
+    for step in ends:
+        step.levels[0].support_from_context.fill_(1 / K)
+    even, _ = partner_attention(steps, clip, seen)
+    np.testing.assert_allclose(even[np.isfinite(even)], 1, rtol=1e-5)

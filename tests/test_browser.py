@@ -145,9 +145,34 @@ SCENE = """g => {
 }"""
 
 
+# Where the points of all frames of a scene of tracks lie in the drawn view, whose borders are -1 and 1; the farthest.
+REACH = """g => {
+    const [cloud, , heads] = g._fullData.map(trace => trace.name)
+    if (cloud !== 'scene' || heads !== 'points') return null
+    const unpack = x => Array.from(x.bdata ? new Float32Array(Uint8Array.from(atob(x.bdata), c => c.charCodeAt()).buffer) : x)
+    const { model, view, projection } = g._fullLayout.scene._scene.glplot.cameraParams
+    const times = (m, p) => [0, 1, 2, 3].map(i => p.reduce((sum, x, j) => sum + m[4 * j + i] * x, 0))
+    const scale = g._fullLayout.scene._scene.dataScale
+    let reach = 0, behind = false
+    for (const frame of g._transitionData._frames)
+        for (const k of [0, 2]) {
+            const [x, y, z] = ['x', 'y', 'z'].map(axis => unpack(frame.data[k][axis]))
+            for (let i = 0; i < x.length; i++) {
+                const p = [x[i] * scale[0], y[i] * scale[1], z[i] * scale[2], 1]
+                const q = times(projection, times(view, times(model, p)))
+                behind ||= q[3] <= 0
+                if (!Number.isNaN(q[0])) reach = Math.max(reach, Math.abs(q[0] / q[3]), Math.abs(q[1] / q[3]))
+            }
+        }
+    return behind ? Infinity : reach
+}"""
+
+
 def move_slider(page, scene):
-    """A click on the slider shows the points of that frame and leaves the view alone."""
+    """A scene of tracks opens on all that it shows; a click on the slider shows a frame's points and leaves the view alone."""
     scene.scroll_into_view_if_needed()
+    reach = scene.evaluate(REACH)
+    assert reach is None or 0.5 < reach < 1
     before = scene.evaluate(SCENE)
     last = len(before["frames"]) - 1
     assert last > 2 and before["shown"] == before["frames"][before["active"]]

@@ -57,3 +57,18 @@ def test_bad_input_is_one_line_and_exit_code_2(wrong, tmp_path):
 def test_help_names_every_command(run, tmp_path):
     result = subprocess.run([sys.executable, str(ROOT / "run.py"), "-h"], cwd=tmp_path, capture_output=True, text=True)
     assert result.returncode == 0 and all(f"\n  {name} " in result.stdout for name in run.COMMANDS)
+
+
+@pytest.mark.parametrize(("unit", "notebooks", "code"), [(0, 0, 0), (1, 0, 1), (0, 3, 3)])
+def test_all_tests_run_side_by_side_and_either_may_fail(run, monkeypatch, capfd, unit, notebooks, code):
+    script = "import sys; print('of ' + sys.argv[-1]); sys.exit({})"
+    codes = {"tests": unit, "notebooks": notebooks}
+
+    def fake(*arguments):
+        return {"args": [sys.executable, "-c", script.format(codes[arguments[-1]]), arguments[-1]]}
+
+    monkeypatch.setattr(run, "_python", fake)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setenv("TAPIP3D_MINUTES", "0.4")
+    assert run.run_test() == code
+    assert capfd.readouterr().out.split("\n")[:2] == ["of tests", "of notebooks"]

@@ -7,6 +7,7 @@ from pathlib import Path
 import nbformat
 import pytest
 
+from lessons.guesses import SHOW
 from lessons.teaching import (
     handout,
     main,
@@ -49,6 +50,10 @@ def test_the_students_version_is_the_solution_minus_blanks(path, pack):
     assert {key: student[key] for key in student if key != "cells"} == {k: solved[k] for k in solved if k != "cells"}
     blanks = 0
     for mine, full in zip(student["cells"], solved["cells"], strict=True):
+        if "guess" in tags(mine):
+            sealed = re.sub(rf'^(\w+\s*=\s*)"{SHOW}"', r"\1None", full["source"], flags=re.MULTILINE)
+            assert sealed == mine["source"] != full["source"]
+            continue
         if "exercise" not in tags(mine):
             assert mine == full
             continue
@@ -87,7 +92,8 @@ def test_the_pack_has_what_its_notebooks_load_and_link(pack):
             assert (path.parent / name).is_file(), name
     for folder in ("student", "solution"):
         lessons = {p.name: p.read_bytes() for p in (ROOT / "notebooks" / "lessons").iterdir() if p.is_file()}
-        assert {p.name: p.read_bytes() for p in (pack / folder / "lessons").iterdir()} == lessons
+        assert {p.name: p.read_bytes() for p in (pack / folder / "lessons").iterdir()} == lessons  # no answers
+    assert "## 03_neighborhoods" in (pack / "ANSWERS.md").read_text("utf-8")
     assert "](../tapip3d_lite" not in (pack / "student" / "FORMULAS.md").read_text("utf-8")
 
 

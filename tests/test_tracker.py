@@ -382,7 +382,9 @@ def test_the_released_configuration_loads(size):
     state["point_updater.virual_tracks"] = state["point_updater.virual_tracks"].transpose(1, 2)
     cfg = {"model": RELEASED} | ({"train_dataset": {"resolution": list(size)}} if size else {})
     loaded = from_official_state(cfg, state | {"time_emb": ours.time[None]})
-    assert loaded.config == ours.config and loaded.config.heads == 8 and loaded.config.head_dim == 48
+    assert (
+        loaded.config == ours.config.replace(corners=True) and loaded.config.heads == 8 and loaded.config.head_dim == 48
+    )
     assert all(torch.equal(x, own[name]) for name, x in loaded.state_dict().items())
     assert sum(p.numel() for p in loaded.parameters()) == pytest.approx(25.7e6, rel=0.01)
 
@@ -474,12 +476,12 @@ def test_clips_of_another_size_are_resized(golden, clip):
 
 
 def blob_clip(size, at, width=6.0):
-    """One frame of size (H, W) with a white blob around the pixel `at`, and a dent of the same form in its depth."""
+    """One frame of size (H, W) with a white blob around the pixel `at`, and a gentle dent of that form in its depth."""
     v, u = np.mgrid[: size[0], : size[1]]
     blob = np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * width**2))
     intrinsics = np.array([[[110.0, 0, 60], [0, 90, 50], [0, 0, 1]]], np.float32)
     video = np.rint(255 * blob)[None, ..., None].repeat(3, -1).astype(np.uint8)
-    return Clip(video, (3 - blob[None]).astype(np.float32), intrinsics, np.eye(4, dtype=np.float32)[None])
+    return Clip(video, (2 - 0.1 * blob[None]).astype(np.float32), intrinsics, np.eye(4, dtype=np.float32)[None])
 
 
 def middle_of(weight):
@@ -493,11 +495,11 @@ def test_image_depth_and_camera_of_a_resized_clip_agree(size):
     """A blob at a known point, found in the image and in the depth, against the point's projection."""
     at = np.array([[24.0, 70.0]])
     clip = blob_clip((96, 128), at[0])
-    point = unproject(at, np.full(1, 2.0), clip.intrinsics[0])
+    point = unproject(at, np.full(1, 1.9), clip.intrinsics[0])
     ratio = np.array([size[1] / 128, size[0] / 96])
     ours, released = (resize_clip(clip, size, corners) for corners in (False, True))
     assert np.array_equal(ours.video, released.video) and np.array_equal(ours.depths, released.depths)
-    seen, dented = middle_of(ours.video[0, ..., 0].astype(float)), middle_of(3.0 - ours.depths[0])
+    seen, dented = middle_of(ours.video[0, ..., 0].astype(float)), middle_of(2.0 - ours.depths[0])
     np.testing.assert_allclose(seen, dented, atol=0.02)
     np.testing.assert_allclose(seen, project(point, ours.intrinsics[0])[0][0], atol=0.02)
     # As released, the camera lies beside the image: by half of 1 - ratio at the edges, not at all in the middle.
@@ -534,6 +536,21 @@ def test_resized_depth_mixes_valid_pixels_only():
     small = resize_clip(clip, (4, 4)).depths[0]
     np.testing.assert_allclose(small[:, :3], 2, atol=1e-5)
     assert not small[:, 3].any()
+
+
+@pytest.mark.parametrize("size", [(12, 12), (7, 9), (40, 33)], ids=str)
+def test_resized_depth_holds_no_mean_of_front_and_back(size):
+    depths = np.full((1, 16, 16), 4, np.float32)
+    depths[0, 5:, 3:9] = 2
+    depths[0, :3] = 0
+    eye = np.eye(4, dtype=np.float32)[None]
+    resized = resize_clip(Clip(np.zeros((1, 16, 16, 3), np.uint8), depths, eye[:, :3, :3], eye), size).depths
+    share = np.abs(resized[..., None] / (2, 4) - 1).min(-1)  # from the nearer of the two depths
+    assert share[resized > 0].max() <= 0.02 and (resized == 0).any()
+    slope = np.linspace(2, 2.3, 16, dtype=np.float32)[None, None].repeat(16, 1)
+    smooth = resize_clip(Clip(np.zeros((1, 16, 16, 3), np.uint8), slope, eye[:, :3, :3], eye), size).depths[0, 0]
+    u = (np.arange(size[1]) + 0.5) * 16 / size[1] - 0.5
+    np.testing.assert_allclose(smooth, 2 + 0.02 * np.clip(u, 0, 15), atol=1e-5)  # where it can, it interpolates
 
 
 def test_the_config_names_the_support_grid_where_the_caller_does_not(golden, clip):

@@ -13,10 +13,9 @@ import torch
 
 import tapip3d_lite as t3d
 from lessons.n06 import LivePlot, learning_curve, tracks_and_truth, train_live
-from lessons.n06_augmentations import TITLES, before_and_after, motion_paths
+from lessons.n06_augmentations import SHOWN, TITLES, augmented, before_and_after, motion_paths
 from lessons.n06_chain import Chain, plain, saving
 from tapip3d_lite.figures.curves import learning_curves
-from tapip3d_lite.figures.flat import MOVING
 from tapip3d_lite.lab import make_trainer
 from tapip3d_lite.simulate import simulate_dataset
 from tests import tiny
@@ -94,7 +93,7 @@ def test_learnt_tracks_stand_beside_the_truth():
     assert [ax.get_title() for ax in figure.axes] == [f"{w} · frame {t}" for w in ("truth", "learnt") for t in (3, 5)]
     shown = int((clip.tracks.visible[5] & (clip.tracks.queries[:, 0] <= 5) & clip.tracks.dynamic).sum())
     truth, learnt = figure.axes[1], figure.axes[3]
-    dots = [line for line in truth.lines if line.get_color() == MOVING]
+    dots = [line for line in truth.lines if line.get_marker() == "o"]
     assert len(dots) == shown > 0
     assert len(learnt.lines) == len(truth.lines) + shown  # what it misses by
     for line in dots:
@@ -193,18 +192,21 @@ def test_what_goes_wrong_while_watched_is_raised(trainer, monkeypatch):
 
 
 def test_the_chain_watches_what_autograd_holds():
-    one, two = (saving(Chain(np.random.default_rng(0), 5)), plain(Chain(np.random.default_rng(0), 5)))
-    for a, b in zip(one[:2], two[:2], strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
-    assert (one[2:], two[2:]) == ((1, 1), (5, 1))
+    chains = [Chain(np.random.default_rng(0), 5) for _ in range(3)]
+    one, two, three = saving(chains[0]), plain(chains[1]), saving(chains[2], leaf=False, keep=True)
+    for other in (two, three):
+        for a, b in zip(one[:2], other[:2], strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+    assert [result[2] for result in (one, two, three)] == [1, 5, 1]
+    assert [chain.passes for chain in chains] == [2, 2, 6]
 
 
-def test_every_augmentation_has_its_two_pictures():
+def test_augmentations_are_shown_in_pairs():
     clip = t3d.simulate_clip(seed=4, frames=6, size=(32, 32), tracks=30)
     figure = before_and_after(clip, frame=2)
     titles = [ax.get_title() for ax in figure.axes]
-    assert [t for t in titles if t] == [f"{name}: {w}" for name in TITLES.values() for w in ("before", "after")]
-    shown = {t: ax for t, ax in zip(titles, figure.axes, strict=True) if t}
+    assert titles == [f"{TITLES[name]}: {w}" for name in SHOWN for w in ("before", "after")]
+    shown = dict(zip(titles, figure.axes, strict=True))
     for name in ("colour jitter", "mirrored in x", "backward in time"):
         before, after = (np.asarray(shown[f"{name}: {w}"].images[0].get_array()) for w in ("before", "after"))
         same = {"mirrored in x": before[:, ::-1], "backward in time": before}.get(name)
@@ -213,10 +215,30 @@ def test_every_augmentation_has_its_two_pictures():
         before_and_after(clip, frame=6)
 
 
-def test_paths_are_drawn_in_three_coordinates():
+@pytest.mark.parametrize("title", TITLES.values())
+def test_each_augmentation_can_be_explored(title):
+    clip = t3d.simulate_clip(seed=4, frames=6, size=(32, 32), tracks=30)
+    axes = augmented(clip, title, seed=1, frame=3).axes
+    assert [ax.get_title() for ax in axes] == [f"{title}: {w}" for _ in range(2) for w in ("before", "after")]
+    assert np.asarray(axes[0].images[0].get_array()).ndim == 3  # colour above, depth below
+    assert np.asarray(axes[2].images[0].get_array()).ndim == 2
+    with pytest.raises(ValueError, match="eraser"):
+        augmented(clip, "nothing", seed=1, frame=3)
+
+
+def test_paths_are_drawn_in_three_coordinates_of_one_scale():
     clip = t3d.simulate_clip(seed=4, frames=6, size=(32, 32), tracks=60, camera="handheld")
     world, camera, moved, turn = motion_paths(clip, still=3, moving=2).axes
     assert [len(ax.lines) for ax in (world, camera, moved)] == [10, 10, 10]
     still = world.lines[0].get_xydata()
     assert np.ptp(still, 0).max() < 1e-5 < np.ptp(camera.lines[0].get_xydata(), 0).max()
     assert len(turn.lines) == 2 and len(turn.lines[0].get_xdata()) == 5
+    sides = [np.ptp(limits) for ax in (world, camera, moved) for limits in (ax.get_xlim(), ax.get_ylim())]
+    np.testing.assert_allclose(sides, sides[0])
+    for ax in (world, camera, moved):
+        for line in ax.lines:
+            assert (np.abs(line.get_xydata() - [np.mean(ax.get_xlim()), np.mean(ax.get_ylim())]) <= sides[0] / 2).all()
+    assert [text.get_text() for text in world.get_legend().get_texts()][:2] == [
+        "point at rest in the world",
+        "moving point",
+    ]

@@ -1,15 +1,24 @@
-"""Notebook 05's figures, film and surgery, by their state."""
+"""Notebook 05's figures, film, look inside and surgery, by their state; its exercises beyond their matrix."""
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
 import tapip3d_lite as t3d
+from lessons import milestone
+from lessons.checker import cases_of, judge
 from lessons.n05 import (
     converging,
+    corrections,
     film,
+    heard,
+    hearing,
+    inside,
+    interval,
+    looks_over_time,
     paired,
-    random_tracker,
     time_in_turns,
     time_ratios,
     token_bar,
@@ -17,8 +26,10 @@ from lessons.n05 import (
     windows_chart,
     without,
 )
-from lessons.n05_exercises import window_starts
+from lessons.n05_exercises import GROUP, TOKEN, token, update_group
+from lessons.n05_windows import BACKWARD, HAND_OVER, WINDOWS, both_ways, hand_over, window_starts
 from tapip3d_lite.geometry import project
+from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.model.updater import token_width
 from tapip3d_lite.model.windows import window_ends
 
@@ -65,6 +76,8 @@ def test_starts_are_the_trackers():
             assert window_starts(frames, window).tolist() == expected
     ax = windows_chart(10, 4, [0, 2, 4, 6], [0, 5]).axes[0]
     assert [list(line.get_xdata()) for line in ax.lines[:4]] == [[0], [5], [], []]
+    words = [text.get_text() for text in ax.texts]
+    assert words == ["query"] * 2 + ["handed over", "last place repeated"] * 3
 
 
 def test_the_film_begins_and_ends_as_the_tracker_does(tracker, clip, queries, shown):
@@ -101,19 +114,61 @@ def test_converging_draws_the_iteration(clip, shown):
 
 
 def test_surgery_acts_and_heals(tracker, clip, queries):
-    def run(rows=queries):
-        return tracker.track(clip, rows, support_grid=0, bidirectional=False, depth_roi=None).xyz
+    def run():
+        return tracker.track(clip, queries, support_grid=0, bidirectional=False, depth_roi=None).xyz
 
     whole = run()
-    for part in ("motion", "virtual tracks"):
+    for part in ("motion", "other tracks", "other frames", "whole block"):
         with without(tracker, part):
             assert np.abs(run() - whole).max() > 1e-5
         np.testing.assert_array_equal(run(), whole)
-    tokens = torch.randn(1, 4, 5, tracker.updater.input.in_features, generator=torch.Generator().manual_seed(0))
-    with torch.no_grad(), without(tracker, "virtual tracks"):  # then nobody hears of anybody
-        torch.testing.assert_close(tracker.updater(tokens[:, :, :1]), tracker.updater(tokens)[:, :, :1])
     with pytest.raises(ValueError, match="part"), without(tracker, "brain"):
         pass
+
+
+def test_surgery_leaves_each_alone(tracker):
+    updater = tracker.updater
+    tokens = torch.randn(2, 4, 5, updater.input.in_features, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        one, frame = updater(tokens[:, :, 2:3]), updater(tokens[:, 1:2])
+        with without(tracker, "other tracks"):
+            torch.testing.assert_close(updater(tokens)[:, :, 2:3], one)
+        with without(tracker, "whole block"):
+            torch.testing.assert_close(updater(tokens)[:, :, :1], updater(tokens[:, :, :1]))
+        with without(tracker, "other frames"):
+            torch.testing.assert_close(updater(tokens)[:, 1:2], frame)
+            active = torch.tensor([[True] * 4 + [False]] * 2)
+            torch.testing.assert_close(updater(tokens, active)[:, :, :4], updater(tokens[:, :, :4]))
+
+
+def test_the_look_inside_sees_what_the_tracker_does(tracker, clip, queries):
+    rows = queries[:4]
+    seen = inside(tracker, clip, rows)
+    assert seen.looks.shape == (2, 3, 4, tracker.config.heads, 4, 4) and len(seen.tokens) == 2
+    np.testing.assert_allclose(seen.looks.sum(-1), 1, atol=1e-5)
+    whole = tracker.track(clip.cut(0, 4), rows, support_grid=0, bidirectional=False)
+    np.testing.assert_allclose(seen.xyz[-1], whole.xyz, atol=1e-5)
+    np.testing.assert_allclose(seen.vis[-1], whole.visible_logits, atol=1e-5)
+    updater = tracker.updater
+    blocks = list(zip(updater.time, updater.gather, updater.mix, updater.scatter, strict=True))
+    for given, tokens, x in zip(seen.given, seen.tokens, seen.x, strict=True):
+        torch.testing.assert_close(token(*given), tokens)
+        torch.testing.assert_close(x[0][:, :4], updater.input(tokens))
+        for group, (before, after) in zip(blocks, pairwise(x), strict=True):
+            torch.testing.assert_close(update_group(before, 4, *group)[:, :4], after[:, :4])
+    assert len(updater.time[0]._forward_pre_hooks) == len(updater.scatter[-1]._forward_hooks) == 0
+    matrix = hearing(update_group, seen.x[0][0], 4, blocks[0])
+    assert matrix.shape == (4, 4) and matrix.min() > 0
+    alone = hearing(lambda x, count, *group: x * 2, seen.x[0][0], 4, blocks[0])
+    assert np.count_nonzero(alone) == 4  # only each point's own
+    assert len(looks_over_time(seen.looks[-1, 0, 1]).axes) == tracker.config.heads + 1
+    assert len(heard([matrix] * 3, 2).axes) == 6
+    moved, logit = corrections(seen.xyz[:, :, 1], seen.vis[:, :, 1], np.array([True, True, False, True])).axes
+    np.testing.assert_allclose(
+        [bar.get_height() for bar in moved.patches[:4]], 100 * np.linalg.norm(seen.xyz[1] - seen.xyz[0], axis=-1)[:, 1]
+    )
+    np.testing.assert_allclose(logit.lines[1].get_ydata(), seen.vis[2, :, 1])
+    assert list(logit.lines[-1].get_xdata()) == [2]
 
 
 def test_without_motion_tokens_say_that_all_stand_still(tracker, clip, queries):
@@ -136,12 +191,11 @@ def test_paired_shows_every_clip():
     assert [t.get_text() for t in ax.get_yticklabels()] == ["a", "b"]
 
 
-def test_a_random_tracker_is_the_same_in_both_forms_and_leaves_the_generator_alone(clip, queries):
-    sizes = {"image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "iterations": 1, "hidden": 32}
-    before = torch.random.get_rng_state()
-    fast, clear = (random_tracker(fast=fast, **sizes).track(clip, queries) for fast in (True, False))
-    assert torch.equal(torch.random.get_rng_state(), before)
-    np.testing.assert_allclose(fast.xyz, clear.xyz, atol=1e-4)
+def test_intervals_are_wide_for_a_few_clips():
+    assert interval(np.array([1.0, 2, 3])) == (2, pytest.approx(4.30 / 3**0.5))
+    assert interval(np.array([5.0])) == (5, float("inf"))
+    many = np.random.default_rng(0).normal(size=400)
+    assert interval(many)[1] == pytest.approx(0.1, abs=0.02)
 
 
 def test_functions_are_timed_in_turns():
@@ -149,3 +203,76 @@ def test_functions_are_timed_in_turns():
     seconds = time_in_turns({name: lambda name=name: called.append(name) for name in "ab"}, rounds=3)
     assert "".join(called) == "abababab" and {name: len(times) for name, times in seconds.items()} == {"a": 3, "b": 3}
     assert time_ratios([2, 6, 3], [1, 2, 2]) == (1.5, 2, 3)
+
+
+def test_the_hand_over_knows_whom_the_window_before_has_solved():
+    def late_from_the_start(coords, vis, queries, start):
+        late = queries[:, 0] >= start
+        first, logits = hand_over(coords, vis, np.where(late[:, None], queries, 0), start)
+        return np.where(late[:, None], queries[:, 1:], first), np.where(late, 0, logits)
+
+    verdict = judge(HAND_OVER, late_from_the_start)
+    assert verdict.status == "wrong" and "a query in the first half is not late" in verdict.hint
+    for _, _, queries, start in cases_of(HAND_OVER):
+        half = len(_) // 2
+        assert {start, start + half - 1, start + half, start + 2 * half - 1} <= set(queries[:, 0])
+
+
+def test_short_clips_are_asked_for():
+    frames = np.array([(frames, window) for frames, window in cases_of(WINDOWS)])
+    assert (frames[:, 0] <= frames[:, 1] // 2).sum() >= 2 and (frames[:, 0] > frames[:, 1]).sum() >= 4
+    assert (frames[:, 0] % (frames[:, 1] // 2) > 0).sum() >= 3
+
+    def by_hand(frames, window):
+        starts, half = [], window // 2
+        while frames > half and (not starts or starts[-1] + window < frames):
+            starts.append(starts[-1] + half if starts else 0)
+        return starts
+
+    assert judge(WINDOWS, by_hand).status == "passed"
+
+
+def test_right_answers_in_other_forms_and_single_precision_pass():
+    def single(answer):
+        return lambda *case: answer(*(x.float() if isinstance(x, torch.Tensor) else x for x in case))
+
+    def single_rows(coords, vis, queries, start):
+        return hand_over(*(x.astype(np.float32) for x in (coords, vis, queries)), start)
+
+    def over_all_frames(x, count, over_time, read, talk, write):
+        x = torch.stack([over_time(x[:, i]) for i in range(x.shape[1])], 1)
+        frames = []
+        for tokens in x:
+            virtual = talk(read(tokens[count:], tokens[:count]))
+            frames.append(torch.cat([write(tokens[:count], virtual), virtual]))
+        return torch.stack(frames)
+
+    def by_masks(forward, backward, queries):
+        result = forward(queries)
+        back = backward(np.c_[len(result) - 1 - queries[:, 0], queries[:, 1:]])
+        for n, t in enumerate(queries[:, 0].astype(int)):
+            result[:t, n] = back[::-1][:t, n]
+        return result.astype(np.float32)
+
+    for exercise, answer in (
+        (TOKEN, single(token)),
+        (GROUP, over_all_frames),
+        (GROUP, single(update_group)),
+        (HAND_OVER, single_rows),
+        (BACKWARD, by_masks),
+    ):
+        assert judge(exercise, answer).status == "passed", judge(exercise, answer)
+
+
+def test_both_ways_is_what_the_library_does(tracker, clip, queries):
+    frames = frames_from_clip(clip)
+    whole = tracker.track(clip, queries, support_grid=0, depth_roi=None)
+
+    def way(frames):
+        return lambda rows: tracker(frames, torch.from_numpy(rows)[None])[0][0].numpy()
+
+    with torch.no_grad():
+        for joined in (milestone.both_ways, both_ways):
+            found = joined(way(frames), way(frames.flip()), queries)
+            np.testing.assert_allclose(found, whole.xyz, atol=1e-4)
+        assert queries[4, 0] == 5 and np.abs(way(frames)(queries)[:5, 4] - whole.xyz[:5, 4]).max() > 1e-3

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -197,12 +197,22 @@ def _gradients(value: object, leaves: list) -> tuple:
     """Gradients of a weighted sum of all results; zeros where none flows."""
     import torch
 
-    parts = [x for x in (value if isinstance(value, tuple) else (value,)) if isinstance(x, torch.Tensor)]
+    parts = list(_tensors(value))
     total = sum((x * torch.cos(torch.arange(x.numel()) + 1.0).view_as(x)).sum() for x in parts if x.requires_grad)
     if not isinstance(total, torch.Tensor):
         return tuple(torch.zeros_like(leaf) for leaf in leaves)
     found = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
     return tuple(gradient.detach() for gradient in found)
+
+
+def _tensors(value: object) -> Iterator:
+    """All tensors of a result, also of tuples in lists."""
+    import torch
+
+    if isinstance(value, torch.Tensor):
+        yield value
+    for part in value if isinstance(value, list | tuple) else ():
+        yield from _tensors(part)
 
 
 def _crash(error: Exception | None) -> str:

@@ -28,7 +28,7 @@ def compare(got: object, expected: object, tolerance: float) -> str:
         return f"expected an array, got {type(got).__name__}"
     if a.shape != b.shape:
         return f"expected shape {b.shape}, got {a.shape}"
-    if b.ndim and a.dtype.kind == "f" and b.dtype.kind in "bi":
+    if b.ndim and a.size and a.dtype.kind == "f" and b.dtype.kind in "bi":
         return f"expected whole numbers ({b.dtype}), got {a.dtype}"
     finite = np.abs(b[np.isfinite(b)].astype(float)) if b.size else b
     rounding = _FLOAT32 * max(1.0, float(finite.max(initial=0.0))) if a.dtype.itemsize <= 4 else 0.0
@@ -73,4 +73,6 @@ def _described(value: object) -> str:
         array = _array(value)
         small = array.size <= 9
         return np.array2string(array, precision=3, suppress_small=True) if small else f"array {array.shape}"
+    if callable(value):
+        return getattr(value, "__name__", type(value).__name__)
     return f"{value:.4g}" if isinstance(value, float) else repr(value)

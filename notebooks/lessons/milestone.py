@@ -2,6 +2,8 @@
 
 Each lesson's `parts(use)` names places in the library, as `"module:attribute"`, and what stands there while the
 functions are plugged in: `use("01.unproject")` gives the learner's function, or the reference while there is none.
+Where lessons meet, one may name places in `KEPT` that another one must leave to the library, as its own functions
+would not be called any more.
 Tracks are computed in double precision: the method amplifies differences of the last digit, and in single precision
 two right orders of summation could give different tracks.
 """
@@ -10,8 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from unittest import mock
 
@@ -22,24 +26,31 @@ import tapip3d_lite as t3d
 from lessons import progress
 from lessons.verdict import Verdict
 from tapip3d_lite.model.frames import Frames, frames_from_clip
+from tapip3d_lite.model.registry import make_module
 
 Use = Callable[[str], Callable[..., object]]
+Pass = Callable[[np.ndarray], np.ndarray]  # queries (N, 4) to tracks (T, N, 3)
 CLIP = Path(__file__).parents[2] / "data_samples" / "handheld.npz"
-_FRAMES, _POINTS = 16, 16  # one window
+_FRAMES, _POINTS = 16, 16  # three windows
 _METRES = 1e-3
 
 
-def milestone(*lessons: str, spaces: tuple[str | None, ...] = (None,)) -> Verdict:
+def milestone(
+    *lessons: str, spaces: tuple[str | None, ...] = (None,), neighborhoods: tuple[str | None, ...] = (None,)
+) -> Verdict:
     """Track a clip with the learner's functions of some lessons, e.g. `milestone("03")`, and compare with the library.
 
-    `spaces` are those to track in, None for the tracker's own.
+    `spaces` are those to track in and `neighborhoods` the kinds to track with, None for the tracker's own. Where a
+    lesson has `BOTH_WAYS`, points are asked for in all frames and tracked both ways in time.
     Passed: each function is the learner's, the tracker called each, and no point is off by a millimetre.
     """
     calls: dict[str, int] = {}
+    late = any(getattr(import_module(f"lessons.n{lesson}"), "BOTH_WAYS", False) for lesson in lessons)
     with plugged(lessons, calls):
-        mine = [_tracks(space) for space in spaces]
-    apart = max(float(np.abs(xyz - _library(space)).max()) for xyz, space in zip(mine, spaces, strict=True))
+        mine = {form: _tracks(*form) for form in product(spaces, [late], neighborhoods)}
+    apart = max(float(np.abs(xyz - _library(*form)).max()) for form, xyz in mine.items())
     where = f", in the spaces {', '.join(map(str, spaces))}" if spaces != (None,) else ""
+    where += f", with the neighbourhoods {', '.join(map(str, neighborhoods))}" if neighborhoods != (None,) else ""
     lines = [f"{len(calls)} functions in the tracker; tracks of {_POINTS} points over {_FRAMES} frames{where}"]
     for name, count in calls.items():
         whose = "yours" if progress.is_yours(name) else "the reference, until yours passes"
@@ -62,8 +73,11 @@ class plugged:
     def __init__(self, lessons: tuple[str, ...], calls: dict[str, int] | None = None) -> None:
         self.calls = {} if calls is None else calls
         self.places: dict[str, object] = {}
-        for lesson in lessons:
-            self.places |= import_module(f"lessons.n{lesson}").parts(self._use)
+        modules = [import_module(f"lessons.n{lesson}") for lesson in lessons]
+        for module in modules:
+            self.places |= module.parts(self._use)
+        for place in (place for module in modules for place in getattr(module, "KEPT", ())):
+            self.places.pop(place, None)
         self._stack = ExitStack()
 
     def _use(self, name: str) -> Callable[..., object]:
@@ -90,10 +104,10 @@ class plugged:
         self._stack.close()
 
 
-def frames_and_queries() -> tuple[Frames, torch.Tensor]:
-    """One window of a clip and queries from its first half, (1, N, 4), in double precision."""
+def frames_and_queries(late: bool = False) -> tuple[Frames, torch.Tensor]:
+    """The first frames of a clip and queries (1, N, 4) in half of them, or in all, in double precision."""
     clip = t3d.load_clip(CLIP)
-    rows = clip.tracks.queries[clip.tracks.queries[:, 0] < _FRAMES // 2]
+    rows = clip.tracks.queries[clip.tracks.queries[:, 0] < (_FRAMES if late else _FRAMES // 2)]
     queries = torch.from_numpy(rows[:: len(rows) // _POINTS][:_POINTS]).double()[None]
     frames = frames_from_clip(clip).cut(0, _FRAMES)
     rgb, depths, intrinsics, poses = (
@@ -105,10 +119,27 @@ def frames_and_queries() -> tuple[Frames, torch.Tensor]:
     return Frames(rgb, depths, intrinsics, poses), queries
 
 
-def _tracks(space: str | None = None) -> np.ndarray:
+def both_ways(forward: Pass, backward: Pass, queries: np.ndarray) -> np.ndarray:
+    """Tracks (T, N, 3) joined from two passes as `model.track.track` joins them, which knows single precision only."""
+    there, turned = forward(queries), queries.copy()
+    turned[:, 0] = len(there) - 1 - turned[:, 0]
+    before = np.arange(len(there))[:, None] < queries[:, 0]
+    return np.where(before[..., None], backward(turned)[::-1], there)
+
+
+def _tracks(space: str | None = None, late: bool = False, neighborhood: str | None = None) -> np.ndarray:
     tracker = t3d.load_tracker("lite", fast=False).double()
+    if neighborhood:
+        config = replace(tracker.config, neighborhood=neighborhood)
+        tracker.neighborhood = make_module("neighborhood", config, fast=False)
+    frames, queries = frames_and_queries(late)
+
+    def way(frames: Frames) -> Pass:
+        return lambda rows: tracker(frames, torch.from_numpy(rows)[None], space=space)[0][0].numpy()
+
+    rows = queries[0].numpy()
     with torch.no_grad():
-        return tracker(*frames_and_queries(), space=space)[0].numpy()
+        return both_ways(way(frames), way(frames.flip()), rows) if late else way(frames)(rows)
 
 
 _library = cache(_tracks)

@@ -53,7 +53,9 @@ _HATCHES = ("", "//", "..", "xx")
 _CLIP = Path(__file__).parents[2] / "data_samples" / "handheld.npz"
 
 
-def scores_bar(scores: Mapping[str, Mapping[str, float]], metrics: Mapping[str, str] | Sequence[str]) -> Figure:
+def scores_bar(
+    scores: Mapping[str, Mapping[str, float]], metrics: Mapping[str, str] | Sequence[str] = ("AJ3D", "APD3D", "OA")
+) -> Figure:
     """Scores of several trackers side by side, with the numbers written on the bars.
 
     Args:
@@ -71,7 +73,7 @@ def scores_bar(scores: Mapping[str, Mapping[str, float]], metrics: Mapping[str, 
         ax.bar_label(bars, fmt="%.2f", fontsize=8, padding=1)
     ax.set_xticks(range(len(names)), names.values())
     ax.set_ylim(0, 1.1)
-    label_axes(ax, "score", "")
+    label_axes(ax, "score, 0 to 1", "")
     ax.tick_params(labelsize=8.5)
     ax.legend(fontsize=8, frameon=False, ncols=len(scores), loc="upper center", bbox_to_anchor=(0.5, 1.2))
     return figure

@@ -40,22 +40,22 @@ HITS = Exercise(
         Mistake(
             "predicted depth",
             lambda p, q, f, k: _nearer(p, q, k * q[..., 2] / f[:, None]),
-            "the radius belongs to the truth: k z* / f with the true depth; else a prediction far away would widen its own target.",
+            "the radius belongs to the truth: k z* / focal with the true depth; else a prediction far away would widen its own target.",
         ),
         Mistake(
             "depth left out",
             lambda p, q, f, k: _nearer(p, q, k / f[:, None]),
-            "k pixels are a length that grows with depth: k z* / f, not k / f.",
+            "k pixels are a length that grows with depth: k z* / focal, not k / focal.",
         ),
         Mistake(
             "pixels for metres",
             lambda p, q, f, k: _nearer(p, q, float(k)),
-            "the error is in metres and k in pixels; turn k into metres first: k z* / f.",
+            "the error is in metres and k in pixels; turn k into metres first: k z* / focal.",
         ),
         Mistake(
             "multiplied by the focal length",
             lambda p, q, f, k: _nearer(p, q, k * p[..., 2] * f[:, None]),
-            "a longer focal length shows more pixels a metre: divide by f.",
+            "a longer focal length shows more pixels a metre: divide by focal.",
         ),
         Mistake(
             "first frame's lens",
@@ -150,7 +150,7 @@ SCORES = Exercise(
         Mistake(
             "J: only misses are false claims",
             _with_jaccard(lambda h, v, w: (h & v & w).sum() / (v.sum() + (w & ~h).sum())),
-            "J_k: a point near a hidden truth that is called visible is a false claim, however near: w and not (hit and v).",
+            "J_k: a point near a hidden truth that is called visible is a false claim, however near: said & ~(hit & seen).",
         ),
         Mistake(
             "J: visible points called hidden cost nothing",

@@ -13,6 +13,7 @@ from lessons.guesses import reveal
 from lessons.milestone import Use, milestone
 from lessons.n02_exercises import EXERCISES
 from lessons.n02_figures import gains, gravity_peak, motion_fit, noise_curves, paths_in_spaces
+from lessons.n02_measures import accelerations, heights, peak, print_table, ratio
 from lessons.n02_straightness import (
     SPACES,
     bend,
@@ -32,6 +33,7 @@ from tapip3d_lite.geometry import invert, point_map, project
 __all__ = [
     "EXERCISES",
     "SPACES",
+    "accelerations",
     "bend",
     "check",
     "collect",
@@ -40,6 +42,7 @@ __all__ = [
     "from_space",
     "gains",
     "gravity_peak",
+    "heights",
     "in_use",
     "line_through",
     "milestone",
@@ -47,8 +50,11 @@ __all__ = [
     "noise_curves",
     "parts",
     "paths_in_spaces",
+    "peak",
     "pipeline",
+    "print_table",
     "progress",
+    "ratio",
     "reset",
     "reveal",
     "rotations",

@@ -6,7 +6,8 @@ import numpy as np
 
 from lessons.checker import Exercise, Mistake
 from lessons.n01 import random_extrinsics, random_intrinsics
-from lessons.n02_pose_exercises import CROSSING, DRIFT, POSE_ERROR
+from lessons.n02_crossing_exercise import CROSSING
+from lessons.n02_pose_exercises import DRIFT, POSE_ERROR
 from lessons.n02_straightness import from_space, line_through, to_space
 from tapip3d_lite.geometry import invert, transform, unproject
 
@@ -100,6 +101,11 @@ REBASE = Exercise(
             "the inverse of x' = R x + b is R^T (x' - b) = R^T x' - R^T b: the translation is turned back, too.",
         ),
         Mistake(
+            "transposed pose for the inverse",
+            lambda x, e, a: (transform(x, a), e @ a.swapaxes(1, 2)),
+            "only a rotation's transpose is its inverse, not that of a whole 4x4 pose.",
+        ),
+        Mistake(
             "transposed matrix",
             lambda x, e, a: (transform(x, _transposed(a)), e @ invert(a)),
             "points are rows: R acts on them as x @ R.T (plus b), not as x @ R.",
@@ -155,6 +161,11 @@ def _rays_for_depth(xyz: Array, k: Array, e: Array) -> Array:
     uvd = to_space(xyz, k, e, "uvd")
     uvd[..., 2] = np.linalg.norm(transform(xyz, e), axis=-1)
     return _rms(from_space(line_through(uvd), k, e, "uvd") - xyz)
+
+
+def _true_depth_back(xyz: Array, k: Array, e: Array) -> Array:
+    uvd = to_space(xyz, k, e, "uvd")
+    return _rms(unproject(line_through(uvd)[..., :2], uvd[..., 2], k, e) - xyz)
 
 
 BEND = Exercise(
@@ -223,6 +234,11 @@ BEND = Exercise(
             "the third number is the depth along the viewing axis, not the length of the ray.",
         ),
         Mistake(
+            "true depth on the way back",
+            _true_depth_back,
+            "your pixels come from the fit, your depth from the path; the third coordinate is fitted, too.",
+        ),
+        Mistake(
             "line through the ends",
             lambda x, k, e: _bent(x, k, e, line=_chord),
             "the line through the first and the last point is not the best one; least squares uses them all.",
@@ -256,4 +272,4 @@ def _uv_z(uvd: Array) -> tuple[Array, Array]:
     return uvd[..., :2], uvd[..., 2]
 
 
-EXERCISES = (REBASE, BEND, POSE_ERROR, DRIFT, CROSSING)
+EXERCISES = (REBASE, BEND, POSE_ERROR, CROSSING, DRIFT)

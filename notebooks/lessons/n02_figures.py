@@ -108,13 +108,14 @@ def _widen(ax: Axes, least: float) -> None:
         ax.set_ylim(middle - least / 2, middle + least / 2)
 
 
-def gains(ratios: Mapping[str, np.ndarray], still: Mapping[str, np.ndarray]) -> Figure:
+def gains(ratios: Mapping[str, np.ndarray], still: Mapping[str, np.ndarray], window: int = 5) -> Figure:
     """What the strength of the hand does: ratios of moving points, and the bend of points at rest.
 
     Args:
         ratios: name of a fit to (4, 3): bend in camera coordinates over bend in the world, with its interval's ends,
             for a tripod and hands of strength 1 to 3.
         still: name of a space to the mean bends (4,) in cm.
+        window: frames of the windows in which those were measured.
     """
     figure = Figure(figsize=(9.4, 3.3), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -129,7 +130,7 @@ def gains(ratios: Mapping[str, np.ndarray], still: Mapping[str, np.ndarray]) -> 
     for name, values in still.items():  # thick below thin: three curves coincide
         right.plot(range(4), values, label=name, **STYLES[name])
     right.set(xlabel="strength of the hand (0: tripod)", ylabel="bend (cm)", xticks=range(4))
-    right.set_title("points at rest, straight line, 5 frames", fontsize=10)
+    right.set_title(f"points at rest, straight line, {window} frames", fontsize=10)
     for ax in (left, right):
         ax.legend(frameon=False, fontsize=8, handlelength=3.5)
     return figure
@@ -148,7 +149,7 @@ def gravity_peak(ball: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray
     for name, values in bodies.items():
         share = 100 * np.histogram(values, edges)[0] / len(values)
         look = {key: value for key, value in STYLES[name].items() if key in ("color", "ls", "lw")}
-        right.stairs(share, edges, label=name, **look)
+        right.stairs(share, edges, baseline=None, label=name, **look)
     right.axvline(-9.81, color="#888", lw=0.8, ls=":", label="free fall")
     right.set(xlabel="upward acceleration (m/s²)", ylabel="points (%)", ylim=(0, None))
     right.set_title("points of moving bodies, hand 1", fontsize=10)
@@ -175,5 +176,5 @@ def noise_curves(sigmas: np.ndarray, curves: Mapping[str, tuple[np.ndarray, np.n
         top = 2.2 * camera.mean()
         ax.set(xlabel="pose noise σ (degrees)", ylabel="bend (cm)", ylim=(0, top), xlim=(0, sigmas[-1]))
         ax.set_title(title, fontsize=9)
-        ax.legend(frameon=False, fontsize=8, loc="lower right")
+        ax.legend(edgecolor="none", framealpha=0.9, fontsize=8, loc="lower right")
     return figure

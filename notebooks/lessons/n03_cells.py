@@ -7,12 +7,14 @@ neighbourhood that lies on the query's own object is a plain count.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 
+from lessons.n03_search import filled, stand_ins
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import point_map, project
 from tapip3d_lite.model.cloud import Level, nearest_exact
@@ -65,7 +67,9 @@ class Cells:
         objects = np.where(clip.depths[frame] > 0, objects[frame], -1)
         return cls(points.astype(np.float32), objects[picked], uv, clip.size)
 
-    def near(self, xyz: np.ndarray, uv: np.ndarray, count: int, kind: str = "knn") -> np.ndarray:
+    def near(
+        self, xyz: np.ndarray, uv: np.ndarray, count: int, kind: str = "knn", by: Callable | None = None
+    ) -> np.ndarray:
         """Neighbourhoods as the tracker's own modules collect them, leaving out cells that have no depth.
 
         Args:
@@ -73,6 +77,7 @@ class Cells:
             uv: (N, 2), where this frame's camera sees them.
             count: K.
             kind: `"knn"` or `"window"`.
+            by: an answer to `03.knn` or `03.window`, in place of the tracker's module; not for windows whose K is no square.
 
         Returns:
             (N, K) int64 into the h * w cells.
@@ -82,6 +87,8 @@ class Cells:
         """
         if kind not in KINDS:
             raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+        if by is not None and (kind == "knn" or round(count**0.5) ** 2 == count):
+            return self._found(xyz, uv, count, kind, by)
         points = torch.from_numpy(self.points)[None, None]
         valid = torch.from_numpy(self.objects >= 0)[None, None]
         level = Level(points.new_zeros(1, 1, *self.objects.shape, 1), points, valid)
@@ -90,6 +97,13 @@ class Cells:
         at = level.cells(torch.as_tensor(uv + 0.5, dtype=torch.float32)[None, None], self.size) - 0.5
         coords = torch.as_tensor(xyz, dtype=torch.float32)[None, None]
         return KINDS[kind](config)(level, coords, at).indices[0, 0].numpy()
+
+    def _found(self, xyz: np.ndarray, uv: np.ndarray, count: int, kind: str, by: Callable) -> np.ndarray:
+        valid, shape = (self.objects >= 0).ravel(), self.objects.shape
+        if kind == "knn":
+            return filled(by(np.float32(xyz), self.points.reshape(-1, 3), count, valid), valid)
+        centers = (uv + 0.5) * np.array(shape[::-1]) / np.array(self.size[::-1]) - 0.5
+        return np.stack([stand_ins(by(center, round(count**0.5), shape), valid) for center in centers])
 
     def right(self, indices: np.ndarray, own: np.ndarray) -> np.ndarray:
         """Share (N,) of neighbours (N, K) that lie on the query's own object (N,)."""

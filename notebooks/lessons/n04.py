@@ -1,43 +1,66 @@
-"""Lesson 04: the waves of an offset, two bags in two images, and who looks at whom."""
+"""Lesson 04: what it shows and measures, its exercises, and where they stand in the tracker."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 
-import numpy as np
-import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import ConnectionPatch
-from matplotlib.ticker import ScalarFormatter
+from torch import Tensor, nn
 
 from lessons.checker import check
 from lessons.guesses import reveal
-from lessons.milestone import milestone
+from lessons.milestone import Use, milestone
+from lessons.n04_bags import Look
+from lessons.n04_cost import clear_and_fast, counted, sized
+from lessons.n04_curves import cost_curves, floors, fourier_waves, rates
 from lessons.n04_exercises import EXERCISES
+from lessons.n04_figures import WAYS, AttentionPair, cell_centers, entropy, two_bags, who_looks_where
 from lessons.n04_votes import paired_bags, similarity_attention, votes
+from lessons.n04_world import (
+    cloud_of,
+    coin,
+    hits,
+    last_updates,
+    mean_and_error,
+    metres_per_unit,
+    paint,
+    partner_attention,
+    tiles,
+    up_to_a_period,
+)
 from lessons.pictures import pipeline, show
 from lessons.progress import collect, in_use, progress, reset
 from lessons.widgets import explore
-from tapip3d_lite.clip import Clip
-from tapip3d_lite.figures.flat import INK, check_drawable, draw_image, label_axes
-from tapip3d_lite.geometry import project
-from tapip3d_lite.model.blocks import DEGREES, fourier
-from tapip3d_lite.recorder import LevelRecord, StepRecord
+from tapip3d_lite.model.blocks import Attention, Block, Pool
+from tapip3d_lite.model.n2n import PairAttention
 
 __all__ = [
     "EXERCISES",
     "WAYS",
     "AttentionPair",
+    "Look",
+    "cell_centers",
     "check",
+    "clear_and_fast",
+    "cloud_of",
+    "coin",
     "collect",
+    "cost_curves",
+    "counted",
     "entropy",
     "explore",
+    "floors",
     "fourier_waves",
+    "hits",
     "in_use",
+    "last_updates",
+    "mean_and_error",
+    "metres_per_unit",
     "milestone",
+    "paint",
+    "pair_by",
     "paired_bags",
+    "partner_attention",
+    "parts",
     "pipeline",
     "progress",
     "rates",
@@ -45,236 +68,47 @@ __all__ = [
     "reveal",
     "show",
     "similarity_attention",
+    "sized",
+    "tiles",
     "two_bags",
+    "up_to_a_period",
     "votes",
     "who_looks_where",
 ]
 
-OWN, SUPPORT, CONTEXT = "#e8a33d", "#2b6cb0", "#d1495b"
-WAYS = ("support looks at context", "context looks at support")
+Function = Callable[..., object]
 
 
-def fourier_waves(reach: float = 1.0, samples: int = 400) -> Figure:
-    """The sines of offsets up to `reach`, a row a degree, and how alike two embeddings are at a distance.
+def parts(use: Use) -> dict[str, object]:
+    """The learner's waves, attention, looks and pooling at their places in the tracker, for `milestone`."""
+    waves, attend, both_ways, pool = (use(f"04.{name}") for name in ("fourier", "attend", "both_ways", "pool"))
 
-    Args:
-        reach: largest offset along one axis, normalised units.
-        samples: along the axis.
-    """
-    fine = 64  # a wave that is finer than a pixel is drawn as its mean, not as an alias of itself
-    x = torch.linspace(0, reach, samples * fine, dtype=torch.float64)[:, None]
-    count = len(DEGREES)
-    waves = fourier(x)[:, 1 : 1 + count].unflatten(0, (samples, fine)).mean(1).numpy()
-    figure = Figure(figsize=(9.6, 2.9), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
-    image = left.imshow(
-        waves.T,
-        aspect="auto",
-        cmap="RdBu",
-        interpolation="nearest",
-        extent=(0, reach, DEGREES[-1] + 0.5, DEGREES[0] - 0.5),
-    )
-    left.set_title("sin(2^j x), one row a degree j", fontsize=9, color=INK)
-    label_axes(left, "degree j", "offset x (normalised)")
-    left.grid(False)
-    figure.colorbar(image, ax=left, fraction=0.04, pad=0.02).ax.tick_params(labelsize=7)
-    distance = np.geomspace(1e-5, 10, samples * fine)
-    for low, high in ((-2, 1), (2, 6), (7, 13)):
-        degrees = np.arange(low, high + 1)
-        # The product of two embeddings depends on their distance only: sin a sin b + cos a cos b = cos(a - b).
-        alike = np.cos(2.0**degrees * distance[:, None]).mean(-1).reshape(samples, fine).mean(1)
-        right.semilogx(distance[::fine], alike, label=f"degrees {low} to {high}")
-    right.set_title("likeness of two embeddings", fontsize=9, color=INK)
-    label_axes(right, "mean of cos(2^j distance)", "distance (normalised)")
-    right.legend(fontsize=7, frameon=False)
-    return figure
+    def pair(self: PairAttention, support: Tensor, context: Tensor) -> Tensor:
+        return pair_by(attend, both_ways, pool)(self, support, context)
+
+    return {"tapip3d_lite.model.blocks:fourier": waves, "tapip3d_lite.model.n2n:PairAttention.forward": pair}
 
 
-def cell_centers(indices: np.ndarray, grid: tuple[int, int], size: tuple[int, int]) -> np.ndarray:
-    """Pixels (..., 2) = (u, v) in images (H, W) that give the cells with these numbers their points."""
-    rows, columns = np.divmod(np.asarray(indices), grid[1])
-    picked = ((c + 0.5) * n / m for c, n, m in ((columns, size[1], grid[1]), (rows, size[0], grid[0])))
-    return np.stack([np.floor(x) for x in picked], -1)
+def pair_by(attend: Function, both_ways: Function, pool: Function) -> Callable[[nn.Module, Tensor, Tensor], Tensor]:
+    """A function (weights of a `PairAttention`, support, context) to what the point learns, made of three functions.
 
-
-@dataclass(frozen=True)
-class AttentionPair:
-    """Two neighbourhoods of one track in the last update of a window: what `two_bags` and `who_looks_where` draw.
-
-    Attributes:
-        clip: the clip.
-        record: one level of that update.
-        frames: of the support and of the context.
-        row: the context's frame, counted in the window.
-        column: the track, counted among the recorded ones.
-        query: (2,) pixel of the query in its own frame.
-        grid: (h, w) of the level.
+    The exercises' functions know no biases of projections; here the layers add them.
     """
 
-    clip: Clip
-    record: LevelRecord
-    frames: tuple[int, int]
-    row: int
-    column: int
-    query: np.ndarray
-    grid: tuple[int, int]
+    def found(layer: Attention, x: Tensor, y: Tensor) -> Tensor:
+        keys, values = layer.to_kv(y).chunk(2, -1)
+        return layer.to_out(attend(layer.to_q(x), keys, values, layer.heads))
 
-    @classmethod
-    def of(
-        cls,
-        clip: Clip,
-        steps: Sequence[StepRecord],
-        queries: np.ndarray,
-        grids: Sequence[tuple[int, int]],
-        track: int = 0,
-        frame: int = 0,
-        level: int = 0,
-    ) -> AttentionPair:
-        """Find a track, frame and level in a forward pass that was recorded.
+    def look(block: Block) -> Look:
+        return Look(block.norm, block.norm_context, lambda x, y: found(block.attention, x, y), block.mlp)
 
-        Args:
-            clip: the clip.
-            steps: of the recorder.
-            queries: (N, 4) that were tracked.
-            grids: (h, w) of each level, `config.grid_sizes`.
-            track: row of the queries.
-            frame: of the context; the last window that contains it counts.
-            level: of the cloud.
+    def gather(layer: Pool, bag: Tensor) -> Tensor:
+        inside = layer.attention
+        weights = inside.to_q.weight, *inside.to_kv.weight.chunk(2), inside.to_out.weight
+        return pool(bag, layer.token[0], weights, inside.heads) + inside.to_out.bias
 
-        Raises:
-            ValueError: nothing was recorded there.
-        """
-        check_drawable(clip, frame=frame)
-        found = [s for s in steps if s.start <= frame < s.start + len(s.xyz) and track in s.columns]
-        if not found:
-            raise ValueError(f"frame: expected one in which track {track} was recorded, got {frame}; take a later one")
-        step, start = found[-1], int(queries[track, 0])
-        uv, _ = project(queries[track : track + 1, 1:], clip.intrinsics[start], clip.extrinsics[start])
-        place = step.columns.index(track)
-        return cls(clip, step.levels[level], (start, frame), frame - step.start, place, uv[0], tuple(grids[level]))
+    def pair(layers: nn.Module, support: Tensor, context: Tensor) -> Tensor:
+        bags = both_ways(support, context, look(layers.support_from_context), look(layers.context_from_support))
+        return gather(layers.pool_support, bags[0]) + gather(layers.pool_context, bags[1])
 
-    @property
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels of the tokens: the query, then the support's cells (1 + K, 2); and the context's cells (K, 2)."""
-        indices = self.record.support.indices[self.column, 1:], self.record.near.indices[self.row, self.column]
-        support, context = (cell_centers(i.numpy(), self.grid, self.clip.size) for i in indices)
-        return np.concatenate([self.query[None], support]), context
-
-    def weights(self, way: str) -> np.ndarray:
-        """How tokens look at each other in one of the two `WAYS`: (1 + K, K) or (K, 1 + K).
-
-        Raises:
-            ValueError: no such way, or a tracker whose context is not `n2n`.
-        """
-        if way not in WAYS:
-            raise ValueError(f"way: expected one of {', '.join(WAYS)}; got {way!r}")
-        looks = self.record.support_from_context if way == WAYS[0] else self.record.context_from_support
-        if looks is None:
-            raise ValueError("record: expected a tracker with context='n2n'; this one has no attention between bags")
-        return looks[self.row, self.column].numpy()
-
-
-def two_bags(pair: AttentionPair) -> Figure:
-    """The cells of both bags in their images, and both bags of offsets over each other, seen along the world's y."""
-    figure = Figure(figsize=(9.6, 3.2), layout="constrained")
-    *images, ax = figure.subplots(1, 3)
-    for image, frame, where, color in zip(images, pair.frames, pair.places, (SUPPORT, CONTEXT), strict=True):
-        name = "support" if color == SUPPORT else "context"
-        _crop(image, pair.clip, frame, where, f"{name}: frame {frame}")
-        image.scatter(*where.T, s=26, color=color, edgecolors="white", linewidths=0.6)
-    record = pair.record
-    image_star, star = images[0], {"marker": "*", "s": 110, "color": OWN, "edgecolors": "white", "zorder": 5}
-    image_star.scatter(*pair.query, **star)
-    bags = record.support.offsets[pair.column, 1:], record.near.offsets[pair.row, pair.column]
-    for offsets, color, name in zip(bags, (SUPPORT, CONTEXT), ("support", "context"), strict=True):
-        ax.scatter(*offsets[:, [0, 2]].numpy().T, s=22, color=color, label=name, alpha=0.8, linewidths=0)
-    ax.scatter(0, 0, label="the point", **star)
-    label_axes(ax, "offset in z", "offset in x")
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.set_title("offsets (normalised)", fontsize=8, color=INK)
-    ax.legend(fontsize=7, frameon=False)
-    return figure
-
-
-def who_looks_where(pair: AttentionPair, token: int = 0, way: str = WAYS[0]) -> Figure:
-    """One token's attention as lines between two images, and the whole matrix beside them.
-
-    Args:
-        pair: two neighbourhoods.
-        token: which token looks; of the support, 0 is the query itself.
-        way: one of `WAYS`.
-
-    Raises:
-        ValueError: a token that the bag does not have.
-    """
-    weights, (support, context) = pair.weights(way), pair.places
-    if not 0 <= token < len(weights):
-        raise ValueError(f"token: expected 0 to {len(weights) - 1} in this bag, got {token}; choose another")
-    figure = Figure(figsize=(9.6, 3.3), layout="constrained")
-    left, right, matrix = figure.subplots(1, 3)
-    for ax, frame, where, name in zip(
-        (left, right), pair.frames, (support, context), ("support", "context"), strict=True
-    ):
-        _crop(ax, pair.clip, frame, where, f"{name}: frame {frame}")
-        ax.scatter(*where.T, s=10, facecolors="none", edgecolors="white", linewidths=0.7)
-    if way == WAYS[0]:
-        _lines(figure, (left, right), support[token], context, weights[token])
-    else:
-        _lines(figure, (right, left), context[token], support, weights[token])
-    image = matrix.imshow(weights, cmap="magma", vmin=0, aspect="auto")
-    matrix.axhline(token, color=OWN, lw=1.2)
-    bits = f"token {token}: entropy {entropy(weights[token]):.2f} of {np.log2(weights.shape[1]):.2f} bits"
-    matrix.set_title(f"{way}\n{bits}", fontsize=8, color=INK)
-    label_axes(matrix, "token that looks", "token that is seen")
-    matrix.grid(False)
-    figure.colorbar(image, ax=matrix, fraction=0.045, pad=0.02).ax.tick_params(labelsize=7)
-    return figure
-
-
-def entropy(weights: np.ndarray) -> np.ndarray:
-    """Bits of distributions (..., n); log2 n where attention is spread evenly, 0 where it rests on one token."""
-    return -(weights * np.log2(np.maximum(weights, 1e-12))).sum(-1)
-
-
-def rates(panels: Mapping[str, Mapping[str, tuple[Sequence[float], np.ndarray]]], xlabel: str, ylabel: str) -> Figure:
-    """Curves with 95 % intervals of the mean, a panel an entry.
-
-    Args:
-        panels: title to (curve to (x values (X,), one row of y values per repetition (R, X))); the same curves in all.
-        xlabel: below each panel.
-        ylabel: beside the first.
-    """
-    figure = Figure(figsize=(3.6 * len(panels) + 1.8, 2.9), layout="constrained")
-    for ax, (title, curves) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
-        for i, (name, (x, y)) in enumerate(curves.items()):
-            y = np.asarray(y, float)
-            error = 1.96 * y.std(0, ddof=1) / np.sqrt(len(y)) if len(y) > 1 else None
-            style = "--" if name.startswith("chance") else "-"
-            ax.errorbar(x, y.mean(0), error, label=name, color=f"C{i}", lw=1.6, ls=style, marker="o", ms=3, capsize=2)
-        label_axes(ax, ylabel, xlabel)
-        ax.set_title(title, fontsize=9, color=INK)
-        ax.set_xscale("log", base=2)
-        ax.xaxis.set_major_formatter(ScalarFormatter())
-    figure.legend(*ax.get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside right center")
-    return figure
-
-
-def _crop(ax: Axes, clip: Clip, frame: int, places: np.ndarray, title: str, margin: float = 7) -> None:
-    """A frame, cut to a square around places (n, 2)."""
-    draw_image(ax, clip.video[frame], title)
-    low, high = places.min(0), places.max(0)
-    half = (high - low).max() / 2 + margin
-    (u, v) = (low + high) / 2
-    ax.set_xlim(u - half, u + half)
-    ax.set_ylim(v + half, v - half)
-
-
-def _lines(figure: Figure, axes: tuple[Axes, Axes], source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> None:
-    one, other = axes
-    one.scatter(*source, s=60, color=OWN, edgecolors="white", zorder=5)
-    other.scatter(*target.T, s=160 * weight / weight.max(), color=OWN, edgecolors="none", alpha=0.9, zorder=4)
-    for place, w in zip(target, weight / weight.max(), strict=True):
-        line = ConnectionPatch(
-            source, place, "data", "data", axesA=one, axesB=other, color=OWN, lw=2 * w, alpha=0.8 * w
-        )
-        figure.add_artist(line)
+    return pair

@@ -1,278 +1,196 @@
-"""Exercises of notebook 04: Fourier features, two bags that look at each other, pooling, and what it costs."""
+"""Exercises of notebook 04: Fourier features and attention with heads; those on whole bags are in `n04_bags`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from lessons.checker import Exercise, Mistake
+from lessons.n04_bags import BOTH_WAYS, POOL
+from lessons.n04_cost import COST
 from tapip3d_lite.model.blocks import DEGREES
 
-Array = np.ndarray
-Weights = tuple[Array, Array, Array, Array]  # W_q, W_k, W_v (E, D) and W_o (D, E), used as x @ W.T
 
-
-def fourier_features(x: Array, degrees: tuple[int, ...] = DEGREES) -> Array:
-    """Offsets (P, 3) to (P, 99): [x | sin(2^j x) | cos(2^j x)], degree by degree."""
+def waves(x: Tensor, degrees: tuple[int, ...] = DEGREES) -> Tensor:
+    """Numbers (..., d) to (..., 33 d): [x | sin(2^i x) | cos(2^i x)], degree by degree."""
     angles = _angles(x, degrees)
-    return np.concatenate([x, np.sin(angles), np.cos(angles)], -1)
+    return torch.cat([x, angles.sin(), angles.cos()], -1)
 
 
-def _angles(x: Array, degrees: tuple[int, ...]) -> Array:
-    return np.concatenate([2.0**j * x for j in degrees], -1)
+def _angles(x: Tensor, degrees: tuple[int, ...] = DEGREES) -> Tensor:
+    return torch.cat([2.0**i * x for i in degrees], -1)
 
 
-def _axis_by_axis(x: Array) -> Array:
-    angles = _angles(x, DEGREES).reshape(len(x), -1, x.shape[-1]).swapaxes(1, 2).reshape(len(x), -1)
-    return np.concatenate([x, np.sin(angles), np.cos(angles)], -1)
+def _by_axis(x: Tensor) -> Tensor:
+    angles = _angles(x).unflatten(-1, (-1, x.shape[-1])).transpose(-1, -2).flatten(-2)
+    return torch.cat([x, angles.sin(), angles.cos()], -1)
 
 
-def _interleaved(x: Array) -> Array:
-    waves = [f(2.0**j * x) for j in DEGREES for f in (np.sin, np.cos)]
-    return np.concatenate([x, *waves], -1)
+def _of(angles: Tensor, x: Tensor) -> Tensor:
+    return torch.cat([x, angles.sin(), angles.cos()], -1)
+
+
+def _offsets(rng: np.random.Generator, size: int) -> tuple[Tensor]:
+    shapes = {1: (1, 3), 2: (3, 2), 3: (2, 2, 3), 4: (3, 1, 2, 3)}
+    # Whole 1024ths: their multiples are exact in single precision, too, so that only real mistakes differ.
+    return (torch.from_numpy(rng.integers(-3000, 3000, size=shapes[size]) / 1024.0),)
 
 
 FOURIER = Exercise(
     "04.fourier",
-    reference=fourier_features,
-    cases=lambda rng, size: (rng.normal(size=(size, 3)),),
+    reference=waves,
+    cases=_offsets,
+    gradients=(0,),
     mistakes=(
         Mistake(
             "offset left out",
-            lambda x: fourier_features(x)[:, x.shape[-1] :],
+            lambda x: waves(x)[..., x.shape[-1] :],
             "the offset itself comes first, before its sines and cosines.",
         ),
         Mistake(
-            "factor pi",
-            lambda x: np.concatenate([x, fourier_features(np.pi * x)[:, 3:]], -1),
-            "here the angle is 2^j x; the pi of other papers does not appear.",
+            "offset at the end",
+            lambda x: torch.cat([_angles(x).sin(), _angles(x).cos(), x], -1),
+            "the offset itself comes first, not last.",
+        ),
+        Mistake(
+            "factor pi", lambda x: _of(torch.pi * _angles(x), x), "here the angle is 2^i x; other papers' pi is not."
         ),
         Mistake(
             "degrees from 0",
-            lambda x: fourier_features(x, tuple(range(16))),
+            lambda x: waves(x, tuple(range(16))),
             "the degrees are -2 to 13: the slowest wave turns four times slower than sin(x).",
         ),
+        Mistake("one degree short", lambda x: waves(x, DEGREES[:-1]), "13 is included, and range(-2, 13) stops at 12."),
         Mistake(
-            "one degree short",
-            lambda x: fourier_features(x, DEGREES[:-1]),
-            "13 is included, and range(-2, 13) stops at 12.",
+            "degrees times two",
+            lambda x: _of(torch.cat([2.0 * i * x for i in DEGREES], -1), x),
+            "2 to the power of i, not 2 times i: every wave is half as long as the one before.",
+        ),
+        Mistake(
+            "fastest first",
+            lambda x: waves(x, DEGREES[::-1]),
+            "the degrees rise from -2 to 13; you begin with the fastest wave.",
         ),
         Mistake(
             "axis by axis",
-            _axis_by_axis,
-            "the order is degree by degree: x, y and z of one degree stand side by side.",
+            _by_axis,
+            "the order is degree by degree: all axes of one degree stand side by side.",
         ),
         Mistake(
             "sine and cosine in turn",
-            _interleaved,
+            lambda x: torch.cat([x, *(f(2.0**i * x) for i in DEGREES for f in (torch.sin, torch.cos))], -1),
             "all sines come first, then all cosines.",
         ),
+        Mistake(
+            "cosines first",
+            lambda x: torch.cat([x, _angles(x).cos(), _angles(x).sin()], -1),
+            "sines come before cosines.",
+        ),
+        Mistake(
+            "gradient cut",
+            lambda x: waves(x.detach()),
+            "a network is trained through these waves: .detach(), .data or a new tensor made of x cut the gradient.",
+        ),
     ),
 )
 
 
-def softmax(scores: Array, axis: int = -1) -> Array:
-    """Exponentials that sum to one along an axis."""
-    powers = np.exp(scores - scores.max(axis, keepdims=True))
-    return powers / powers.sum(axis, keepdims=True)
+def attend(queries: Tensor, keys: Tensor, values: Tensor, heads: int, **slip: object) -> Tensor:
+    """What queries (..., K + 1, A d) find among keys and values (..., K, A d), every head for itself: (..., K + 1, A d).
+
+    A `slip` makes one mistake.
+    """
+    q, k, v = (
+        x.unflatten(-1, (heads, -1)).transpose(-2, -3) for x in (queries, keys, values)
+    )  # (..., A, K + 1 or K, d)
+    width = {"whole": queries.shape[-1], "none": 1, "squared": q.shape[-1] ** 2}.get(slip.get("scale"), q.shape[-1])
+    weights = (q @ k.mT / width**0.5).softmax(slip.get("axis", -1))
+    found = (weights.detach() if slip.get("cut") else weights) @ v
+    return found.reshape(queries.shape) if slip.get("scrambled") else found.transpose(-2, -3).flatten(-2)
 
 
-def look(x: Array, context: Array, weights: Weights, **slip: object) -> Array:
-    """Let x (Q, D) look at context (M, D): x + Out(softmax(q k^T / sqrt(E)) v); `slip` makes one mistake."""
-    w_q, w_k, w_v, w_o = (w.T for w in weights) if slip.get("transposed") else weights
-    q, k, v = x @ w_q.T, context @ w_k.T, context @ w_v.T
-    scores = q @ k.T * (1 if slip.get("unscaled") else len(w_q) ** -0.5)
-    seen = softmax(scores, slip.get("axis", -1)) @ v @ w_o.T
-    return seen if slip.get("alone") else x + seen
+def _interleaved(queries: Tensor, keys: Tensor, values: Tensor, heads: int) -> Tensor:
+    order = torch.arange(queries.shape[-1]).view(-1, heads).T.flatten()  # every heads-th channel belongs to one head
+    return attend(*(x[..., order] for x in (queries, keys, values)), heads)[..., order.argsort()]
 
 
-def both_ways(support: Array, context: Array, first: Weights, second: Weights) -> tuple[Array, Array]:
-    """Cross-attention in both directions at once: (M, D) and (K, D)."""
-    return look(support, context, first), look(context, support, second)
+def _attended(rng: np.random.Generator, size: int) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Numbers of tokens, heads and their widths differ, so that no two axes can be taken for each other."""
+    heads, width, lead = ((1, 3, ()), (2, 3, (2,)), (3, 2, (2, 2)), (2, 5, (3, 2)))[size - 1]
+    shapes = ((*lead, n, heads * width) for n in (size + 1, size + 3, size + 3))
+    return *(torch.from_numpy(rng.normal(size=s)) for s in shapes), heads
 
 
-def _weights(rng: np.random.Generator, width: int, inner: int) -> Weights:
-    return tuple(rng.normal(size=s) for s in ((inner, width), (inner, width), (inner, width), (width, inner)))
+def _slipped(**slip: object) -> Callable[..., Tensor]:
+    return lambda q, k, v, heads: attend(q, k, v, heads, **slip)
 
 
-def _two_bags(rng: np.random.Generator, size: int) -> tuple:
-    width, inner = 2 * size, 2 * size + 1  # different, so that a transposed matrix cannot fit by chance
-    inner = width if size == 1 else inner
-    bags = rng.normal(size=(size + 2, width)), rng.normal(size=(size + 1, width))
-    return *bags, _weights(rng, width, inner), _weights(rng, width, inner)
-
-
-def _slipped(**slip: object) -> Callable[..., tuple[Array, Array]]:
-    return lambda s, c, a, b: (look(s, c, a, **slip), look(c, s, b, **slip))
-
-
-BOTH_WAYS = Exercise(
-    "04.both_ways",
-    reference=both_ways,
-    cases=_two_bags,
+ATTEND = Exercise(
+    "04.attend",
+    reference=attend,
+    cases=_attended,
+    gradients=(0, 1, 2),
     mistakes=(
-        Mistake(
-            "transposed matrix",
-            _slipped(transposed=True),
-            "tokens are rows, and a weight matrix maps D to E as rows of W: multiply by W.T from the right.",
-        ),
-        Mistake(
-            "softmax over the wrong axis",
-            _slipped(axis=0),
-            "every token divides its own attention among the other bag: each ROW of the weights sums to one.",
-        ),
         Mistake(
             "missing scale",
-            _slipped(unscaled=True),
-            "divide the scores by the square root of the width of q before the softmax.",
+            _slipped(scale="none"),
+            "divide the scores by the square root of a head's width before the softmax.",
         ),
         Mistake(
-            "missing residual",
-            _slipped(alone=True),
-            "what a token has seen is added to what it was: x + ..., or the token forgets itself.",
+            "root of all heads' width",
+            _slipped(scale="whole"),
+            "the scale is the root of ONE head's width d = width / heads: a head's scores sum d products, not all of them.",
+        ),
+        Mistake("divided by the width", _slipped(scale="squared"), "divide by the square root of d, not by d itself."),
+        Mistake(
+            "softmax over those who look",
+            _slipped(axis=-2),
+            "every token divides its own attention among those that it sees: each ROW of the weights sums to one.",
         ),
         Mistake(
-            "one after the other",
-            lambda s, c, a, b: (look(s, c, a), look(c, look(s, c, a), b)),
-            "both bags look at the same time: the context must see the support as it was before.",
+            "softmax over the heads",
+            _slipped(axis=-3),
+            "heads do not share their attention; each has a softmax of its own, over the tokens that are seen.",
         ),
         Mistake(
-            "looks at its own bag",
-            lambda s, c, a, b: (look(s, s, a), look(c, c, b)),
-            "that is self-attention; keys and values come from the other bag.",
+            "heads forgotten",
+            lambda q, k, v, heads: attend(q, k, v, 1),
+            "you have one softmax for the whole width; cut it into heads first, each with weights of its own.",
         ),
         Mistake(
-            "one set of weights",
-            lambda s, c, a, b: (look(s, c, a), look(c, s, a)),
-            "each direction has its own weights: the second one uses `second`.",
+            "heads interleaved",
+            _interleaved,
+            "heads lie side by side: the first d channels are the first head's, unflatten(-1, (heads, -1)).",
+        ),
+        Mistake(
+            "heads not put back",
+            _slipped(scrambled=True),
+            "bring the axis of the heads back behind that of the tokens before you join them; a reshape alone mixes tokens.",
+        ),
+        Mistake(
+            "keys and values swapped",
+            lambda q, k, v, heads: attend(q, v, k, heads),
+            "the scores come from the keys, and what is mixed are the values.",
+        ),
+        Mistake(
+            "keys mixed",
+            lambda q, k, v, heads: attend(q, k, k, heads),
+            "you mix the keys; they only say who is looked at. What flows are the values.",
+        ),
+        Mistake(
+            "mean of the values",
+            lambda q, k, v, heads: attend(q * 0, k, v, heads),
+            "every query finds the same: the mean of the values. The weights must depend on queries and keys.",
+        ),
+        Mistake(
+            "weights cut off",
+            _slipped(cut=True),
+            "queries and keys learn through the weights: leave them in the graph, without .detach() or no_grad().",
         ),
     ),
 )
 
-
-def pool(bag: Array, token: Array, weights: Weights) -> Array:
-    """A learned token (D,) gathers a bag (M, D) to (D,): no residual."""
-    return look(token[None], bag, weights, alone=True)[0]
-
-
-def _bag(rng: np.random.Generator, size: int) -> tuple:
-    width = 2 * size
-    weights = _weights(rng, width, width if size == 1 else width + 1)
-    return rng.normal(size=(size + 1, width)), rng.normal(size=width), weights
-
-
-def _mean_pool(bag: Array, token: Array, weights: Weights) -> Array:
-    return (bag @ weights[2].T @ weights[3].T).mean(0)
-
-
-def _max_pool(bag: Array, token: Array, weights: Weights) -> Array:
-    _, _, w_v, w_o = weights
-    scores = bag @ weights[1].T @ (weights[0] @ token)
-    return bag[scores.argmax()] @ w_v.T @ w_o.T
-
-
-POOL = Exercise(
-    "04.pool",
-    reference=pool,
-    cases=_bag,
-    mistakes=(
-        Mistake(
-            "mean",
-            _mean_pool,
-            "this is the mean of the bag; the learned token decides who counts how much.",
-        ),
-        Mistake(
-            "winner takes all",
-            _max_pool,
-            "you take the best token only; the softmax mixes all of them.",
-        ),
-        Mistake(
-            "residual added",
-            lambda bag, token, w: look(token[None], bag, w)[0],
-            "the pooling has no residual: only what the token gathered leaves the bag.",
-        ),
-        Mistake(
-            "softmax over the wrong axis",
-            lambda bag, token, w: look(token[None], bag, w, alone=True, axis=0)[0],
-            "your weights are all 1: the softmax runs over the M tokens of the bag, not over the single query.",
-        ),
-        Mistake(
-            "missing scale",
-            lambda bag, token, w: look(token[None], bag, w, alone=True, unscaled=True)[0],
-            "divide the scores by the square root of the width of q.",
-        ),
-        Mistake(
-            "token in the bag",
-            lambda bag, token, w: look(token[None], np.concatenate([token[None], bag]), w, alone=True)[0],
-            "the learned token asks; it is not itself part of the bag.",
-        ),
-        Mistake(
-            "output matrix forgotten",
-            lambda bag, token, w: look(token[None], bag, (*w[:3], np.eye(len(w[0]))), alone=True)[0],
-            "the mixed values still have to pass through W_o.",
-        ),
-    ),
-)
-
-
-def pair_cost(k: int, d: int) -> int:
-    """Multiply-adds of N2N for one point in one frame: K context and K + 1 support tokens of width D."""
-    return sum(_block(m, n, d) + _pooled(m, d) for m, n in ((k + 1, k), (k, k + 1)))
-
-
-def _block(m: int, n: int, d: int, **slip: int) -> int:
-    """Let m tokens look at n tokens, then pass the MLP."""
-    scores = slip.get("scores", 2) * m * n * d
-    return scores + (2 * m + slip.get("context", 2) * n) * d**2 + slip.get("mlp", 2) * m * d**2
-
-
-def _pooled(m: int, d: int) -> int:
-    return 2 * d**2 + 2 * m * d**2 + 2 * m * d
-
-
-def _counted(pools: bool = True, **slip: int) -> Callable[[int, int], int]:
-    def count(k: int, d: int) -> int:
-        both = ((k + 1, k), (k, k + 1))
-        return sum(_block(m, n, d, **slip) + pools * _pooled(m, d) for m, n in both)
-
-    return count
-
-
-COST = Exercise(
-    "04.cost",
-    reference=pair_cost,
-    cases=lambda rng, size: (int(rng.integers(2, 5)) * size, int(rng.integers(3, 9)) * size),
-    tolerance=1e-9,
-    mistakes=(
-        Mistake(
-            "one direction",
-            lambda k, d: _block(k + 1, k, d) + _pooled(k + 1, d),
-            "you counted one direction; the context looks back, and is pooled as well.",
-        ),
-        Mistake(
-            "values forgotten",
-            _counted(scores=1),
-            "m n d multiply-adds make the scores, and as many again mix the values.",
-        ),
-        Mistake(
-            "three projections",
-            _counted(context=1),
-            "one look needs four projections: queries and output for those who look, keys and values for the others.",
-        ),
-        Mistake("MLP forgotten", _counted(mlp=0), "after each look comes an MLP of two layers: 2 m d^2."),
-        Mistake("pooling forgotten", _counted(pools=False), "both bags still have to be pooled."),
-        Mistake(
-            "twice as many",
-            lambda k, d: 2 * pair_cost(k, d),
-            "count a multiplication and its addition as one; FLOPs are twice as many.",
-        ),
-        Mistake(
-            "K tokens on both sides",
-            lambda k, d: 2 * (_block(k, k, d) + _pooled(k, d)),
-            "the support has K + 1 tokens: the query itself comes first.",
-        ),
-    ),
-)
-
-EXERCISES = (FOURIER, BOTH_WAYS, POOL, COST)
+EXERCISES = (FOURIER, ATTEND, BOTH_WAYS, POOL, COST)

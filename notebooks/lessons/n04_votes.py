@@ -1,8 +1,8 @@
 """What a neighbourhood knows that a point does not, before any training: two bags of cells vote for where a point went.
 
-Paper: section 3.2 (neighbourhood to neighbourhood) and the table on N2N (against point to neighbourhood). If support token i
-looks at context token m, then it believes in the displacement that carries i to m. A context cell j wins if many
-tokens believe in the displacement that carries the point to j. A point alone is a bag with one token.
+The vote is ours. It stands for what the paper's N2N (section 3.2) can know, against a point alone (its table on N2N). If
+support token i looks at context token j, then it believes in the displacement that carries i to j. A context cell j'
+wins if many tokens believe in the displacement that carries the point to j'. A point alone is a bag with one token.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def similarity_attention(support: Tensor, context: Tensor, sharpness: float = 5.
 
 
 def votes(attention: Tensor, support_offsets: Tensor, context_offsets: Tensor, width: float = 0.5) -> Tensor:
-    """Votes for every context cell j: sum over i, m of (A_im - 1/K) exp(-|o_m - o_i - o_j|^2 / (2 h^2)).
+    """Votes for every context cell j': sum over i, j of (a_ij - 1/K) exp(-|d_j - d_i - d_j'|^2 / (2 sigma^2)), d offsets.
 
     The 1/K takes away what the bags' shapes alone would say, whatever the tokens look at.
 
@@ -103,7 +103,7 @@ def votes(attention: Tensor, support_offsets: Tensor, context_offsets: Tensor, w
         attention: (P, M, K), how support tokens look at context tokens.
         support_offsets: (P, M, 3).
         context_offsets: (P, K, 3).
-        width: h, in units of the usual distance between neighbouring cells of the context.
+        width: sigma, in units of the usual distance between neighbouring cells of the context.
 
     Returns:
         (P, K).
@@ -117,10 +117,10 @@ def votes(attention: Tensor, support_offsets: Tensor, context_offsets: Tensor, w
 def _votes(attention: Tensor, support: Tensor, context: Tensor, width: float) -> Tensor:
     count = context.shape[1]
     spacing = torch.cdist(context, context) + torch.eye(count).to(context) * 1e9
-    h = width * spacing.min(-1).values.median(-1).values[:, None, None]
-    between = (context[:, None] - context[:, :, None]).flatten(1, 2)  # (P, K K, 3): o_m - o_j, j first
-    kernel = (-(torch.cdist(support, between) / h).square() / 2).exp()  # (P, M, K K)
-    return torch.einsum("pim,pijm->pj", attention - 1 / count, kernel.unflatten(-1, (count, count)))
+    sigma = width * spacing.min(-1).values.median(-1).values[:, None, None]
+    between = (context[:, None] - context[:, :, None]).flatten(1, 2)  # (P, K K, 3): d_j - d_j', j' first
+    kernel = (-(torch.cdist(support, between) / sigma).square() / 2).exp()  # (P, M, K K)
+    return torch.einsum("pij,pikj->pk", attention - 1 / count, kernel.unflatten(-1, (count, count)))
 
 
 def _around(level: Level, frame: int, centers: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,227 +1,173 @@
-"""Exercises of notebook 05: the token, windows and what they hand over, virtual tracks, and time run backward."""
+"""Exercises of notebook 05, first part: the token of equation (2), and one group of the updater's blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from lessons.checker import Exercise, Mistake
-from lessons.n04_exercises import fourier_features, softmax
+from lessons.n05_windows import BACKWARD, HAND_OVER, WINDOWS
+from tapip3d_lite.model.blocks import fourier
 
-Array = np.ndarray
+Look = Callable[..., Tensor]
 
 
-def token(coords: Array, logits: Array, evidence: Array, uv: Array, size: tuple[int, int], **slip: object) -> Array:
-    """Coordinates (S, N, 3), logits (S, N), evidence (S, N, E), pixels (S, N, 2): (S, N, 1 + E + 264), no time yet."""
-    after = np.concatenate([coords[1:], coords[:1] if slip.get("wrap") else coords[-1:]])
-    before = np.concatenate([coords[-1:] if slip.get("wrap") else coords[:1], coords[:-1]])
-    sign = -1 if slip.get("velocity") else 1
-    motion = np.concatenate([coords - after, coords - before] if sign == 1 else [after - coords, coords - before], -1)
-    motion = np.concatenate([motion[..., 3:], motion[..., :3]], -1) if slip.get("past first") else motion
-    motion = np.concatenate([coords, coords], -1) if slip.get("absolute") else motion
-    sides = np.array(size if slip.get("rows first") else size[::-1]) - (0 if slip.get("whole sides") else 1)
-    return np.concatenate([logits[..., None], evidence, fourier_features(motion), fourier_features(uv / sides)], -1)
+def token(
+    coords: Tensor, logits: Tensor, evidence: Tensor, uv: Tensor, size: tuple[int, int], time: Tensor, slip: str = ""
+) -> Tensor:
+    """Coordinates (S, N, 3), logits (S, N), evidence (S, N, L D), pixels (S, N, 2), time (S, G): tokens (S, N, G)."""
+    last, first = (coords[:1], coords[-1:]) if slip == "wrapped" else (coords[-1:], coords[:1])
+    to_next, to_last = coords - torch.cat([coords[1:], last]), coords - torch.cat([first, coords[:-1]])
+    to_next, to_last = {
+        "paper": (-to_next, to_last),
+        "signs": (-to_next, -to_last),
+        "past": (to_last, to_next),
+        "place": (coords, coords),
+    }.get(slip, (to_next, to_last))
+    waves = fourier(torch.cat([to_next, to_last], -1))
+    waves = torch.cat([fourier(to_next), fourier(to_last)], -1) if slip == "apart" else waves
+    evidence = evidence.detach() if slip == "detached" else evidence
+    logits = logits.sigmoid() if slip == "sigmoid" else logits
+    parts = [logits[..., None], evidence, waves, fourier(_pixels(uv, size, slip))]
+    whole = torch.cat(parts if slip != "late logit" else [*parts[1:], parts[0]], -1)
+    if slip == "appended":
+        return torch.cat([whole, time[:, None].expand_as(whole)], -1)
+    return whole if slip == "timeless" else whole + time[:, None]
+
+
+def _pixels(uv: Tensor, size: tuple[int, int], slip: str) -> Tensor:
+    sides = torch.tensor(size if slip == "rows" else size[::-1], dtype=uv.dtype)
+    limit = {"unlimited": 1e9 * sides, "once": sides, "short": 2 * (sides - 1)}.get(slip, 2 * sides)
+    inside = torch.minimum(torch.maximum(uv, 0 * limit if slip == "positive" else -limit), limit)
+    return inside if slip == "raw" else inside / (sides if slip == "whole sides" else sides - 1)
 
 
 def _token_case(rng: np.random.Generator, size: int) -> tuple:
-    shape = size + 2, size
-    return (
-        rng.normal(size=(*shape, 3)),
-        rng.normal(size=shape),
-        rng.normal(size=(*shape, 2 * size)),
-        rng.uniform(0, 16, size=(*shape, 2)),
-        (16 + size, 30 + size),
-    )
+    sides = tuple(int(x) for x in rng.permutation([8 + 4 * size, 13 + 6 * size]) + 1)
+    frames, tracks, width = size + 2, size, 2 * size
+    shapes = (frames, tracks, 3), (frames, tracks), (frames, tracks, width)
+    uv = rng.uniform(-0.2, 1.2, size=(frames, tracks, 2)) * sides[::-1]
+    far = rng.choice([-2.6, -1.9, 2.4, 1.2], size=uv.shape) * sides[::-1]  # left behind by the camera
+    uv = np.where(rng.random(uv.shape) < 0.4, far, uv)
+    uv[0, 0], uv[1, 0] = (2.6 * sides[1], -1.2 * sides[0]), (-2.6 * sides[1], 2.6 * sides[0])
+    time = rng.normal(size=(frames, 1 + width + 264))
+    coords, logits, evidence, uv, time = map(torch.from_numpy, (*map(rng.normal, *_normal(shapes)), uv, time))
+    return coords, logits, evidence, uv, sides, time
 
 
-def _token(**slip: object) -> Callable[..., Array]:
-    return lambda *arguments: token(*arguments, **slip)
+def _normal(shapes: tuple) -> tuple:
+    return (0.0,) * len(shapes), (1.0,) * len(shapes), shapes
 
+
+_TOKEN_HINTS = {
+    "wrapped": "the window has no frame before its first or after its last: that difference is 0.",
+    "paper": "that is how the paper writes motion, the next minus this; the released code and this exercise take this "
+    "minus the next.",
+    "signs": "both signs are turned: this estimate minus its neighbours in time, not the neighbours minus this one.",
+    "past": "the motion to the next frame comes first, then that to the one before.",
+    "place": "the token has differences, not positions.",
+    "apart": "join both motions to six numbers, then take the features once: all numbers, all sines, all cosines.",
+    "detached": "the evidence must keep its history: through it the loss reaches N2N and the encoder.",
+    "sigmoid": "the token holds the logit itself, not its sigmoid.",
+    "late logit": "visibility comes first.",
+    "rows": "u belongs to the width: size is (H, W), pixels are (u, v).",
+    "whole sides": "the centre of the last pixel lies at W - 1 and should become 1.",
+    "raw": "divide pixels by (W - 1, H - 1): a place in the image, whatever its size.",
+    "unlimited": "a point far outside the image counts as one at 2 W or 2 H at most, on either side.",
+    "once": "the limit is twice the image's side, not once.",
+    "short": "the limit is 2 W and 2 H; the 1 is subtracted only from what you divide by.",
+    "positive": "the limit to the left and above is -2 W and -2 H, not 0.",
+    "appended": "the paper sets the time beside the rest; the released code and this exercise add it.",
+    "timeless": "the embedding of time is missing: (S, G), the same for all tracks of a frame.",
+}  # fmt: skip
 
 TOKEN = Exercise(
     "05.token",
     reference=token,
     cases=_token_case,
-    mistakes=(
-        Mistake("wrapped round", _token(wrap=True), "the window has no frame before its first or after its last: 0."),
-        Mistake(
-            "velocity to the next frame",
-            _token(velocity=True),
-            "the estimate minus that of the next frame, and the estimate minus that of the one before: self comes first.",
-        ),
-        Mistake("previous frame first", _token(**{"past first": True}), "motion to the next frame comes first."),
-        Mistake("position in place of motion", _token(absolute=True), "the token has differences, not positions."),
-        Mistake(
-            "height for width", _token(**{"rows first": True}), "u belongs to the width: divide by (W - 1, H - 1)."
-        ),
-        Mistake(
-            "pixel-centre slip",
-            _token(**{"whole sides": True}),
-            "the centre of the last pixel is at W - 1 and should become 1.",
-        ),
-    ),
+    mistakes=tuple(Mistake(slip, partial(token, slip=slip), hint) for slip, hint in _TOKEN_HINTS.items()),
+    tolerance=2e-3,  # in single precision the fastest waves are off by 1e-3
+    gradients=(2,),
 )
 
 
-def window_starts(frames: int, window: int) -> Array:
-    """First frames of the windows of a clip that is padded to whole half windows: 0, S / 2, S, ..."""
-    half = window // 2
-    padded = -(-frames // half) * half
-    return np.arange(0, padded - window + 1, half)
+class Attention:
+    """Attention with random weights, without norms or MLP, as a case of an exercise: `x + attention(x, seen)`."""
+
+    def __init__(self, width: int, seed: int, name: str) -> None:
+        self.weights = torch.randn(3, width, width, generator=torch.Generator().manual_seed(seed)).double() / 2
+        self.name = name
+
+    def __call__(self, x: Tensor, seen: Tensor | None = None) -> Tensor:
+        """(..., X, U) that looks at seen (..., Y, U), or at itself."""
+        seen = x if seen is None else seen
+        query, key, value = self.weights.to(x.dtype)
+        scores = x @ query @ (seen @ key).transpose(-1, -2) / x.shape[-1] ** 0.5
+        return x + scores.softmax(-1) @ (seen @ value)
+
+    def __repr__(self) -> str:
+        return f"<{self.name}>"
 
 
-WINDOWS = Exercise(
-    "05.windows",
-    reference=window_starts,
-    cases=lambda rng, size: (4 * (size + 1) + int(rng.integers(1, size + 1)), 2 * size + 2),
-    mistakes=(
-        Mistake("no overlap", lambda t, s: np.arange(0, t, s), "windows overlap by half: each starts S / 2 later."),
-        Mistake(
-            "not padded",
-            lambda t, s: np.arange(0, t - s + 1, s // 2),
-            "the last frames are in no window; pad the clip to a multiple of S / 2 first.",
-        ),
-        Mistake(
-            "windows over the end",
-            lambda t, s: np.arange(0, t, s // 2),
-            "a window must end within the padded clip: start + S <= padded length.",
-        ),
-        Mistake(
-            "ends in place of starts",
-            lambda t, s: window_starts(t, s) + s,
-            "these are the ends; subtract S.",
-        ),
-    ),
+def update_group(x: Tensor, count: int, over_time: Look, read: Look, talk: Look, write: Look, slip: str = "") -> Tensor:
+    """Tokens (S, N + V, U), points first, after a look over time and the way through virtual tracks; same shape."""
+    if slip == "points in time":
+        x = torch.cat([_over_frames(over_time, x[:, :count]), x[:, count:]], 1)
+    elif slip != "timeless":
+        x = over_time(x) if slip == "tracks as time" else _over_frames(over_time, x)
+    points, virtual = x[:, :count], x[:, count:]
+    if slip == "all look at all":
+        return over_time(x)
+    if slip == "write first":
+        points = write(points, virtual)
+    old, virtual = virtual, read(virtual, points.detach() if slip == "detached" else points)
+    if slip == "talk first":
+        virtual = read(talk(old), points)
+    elif slip != "no talk":
+        virtual = talk(virtual)
+    if slip != "write first":
+        points = write(points, old if slip == "old virtual" else virtual)
+    if slip == "swapped":
+        return torch.cat([virtual, points], 1)
+    return torch.cat([points, old if slip == "forgotten" else virtual], 1)
+
+
+def _over_frames(over_time: Look, x: Tensor) -> Tensor:
+    return over_time(x.transpose(0, 1)).transpose(0, 1)
+
+
+def _group_case(rng: np.random.Generator, size: int) -> tuple:
+    width, count = size + 3, size + 2
+    x = torch.from_numpy(rng.normal(size=(size + 1, count + size, width)))
+    names = "attention over time", "virtual read points", "virtual talk", "points read virtual"
+    return x, count, *(Attention(width, int(rng.integers(1 << 30)), name) for name in names)
+
+
+_GROUP_HINTS = {
+    "tracks as time": "a block looks along the last axis but one: bring the frames there, and back afterwards.",
+    "points in time": "virtual tracks are tracks: they look over time, too.",
+    "timeless": "the group begins with the look over time.",
+    "no talk": "between reading and writing the virtual tracks look at each other.",
+    "talk first": "virtual tracks read first, and then talk about what they have read.",
+    "write first": "points read last: they hear what the virtual tracks have just learnt.",
+    "old virtual": "points must read the virtual tracks as they are after talking, not as they were.",
+    "forgotten": "the next group goes on with the virtual tracks as they are now: return those.",
+    "swapped": "points stand first, virtual tracks behind them.",
+    "detached": "what points tell the virtual tracks must keep its history.",
+    "all look at all": "points never look at points; they go through read, talk and write.",
+}
+
+GROUP = Exercise(
+    "05.group",
+    reference=update_group,
+    cases=_group_case,
+    mistakes=tuple(Mistake(slip, partial(update_group, slip=slip), hint) for slip, hint in _GROUP_HINTS.items()),
+    tolerance=1e-3,
+    gradients=(0,),
 )
 
-
-def hand_over(previous: Array, queries: Array, start: int) -> Array:
-    """What the window at `start` begins with: previous (S, N, 3), queries (N, 4); the result is (S, N, 3)."""
-    half = len(previous) // 2
-    first = np.concatenate([previous[half:], np.repeat(previous[-1:], half, 0)])
-    return np.where((queries[:, 0] < start + half)[:, None], first, queries[:, 1:])
-
-
-def _hand_over_case(rng: np.random.Generator, size: int) -> tuple:
-    start, half = size + 1, size + 1
-    times = np.r_[rng.integers(0, start, size), start + half, start + half + rng.integers(0, half)]
-    queries = np.concatenate([times[:, None], rng.normal(size=(len(times), 3))], -1)
-    return rng.normal(size=(2 * half, len(times), 3)), queries, start
-
-
-def _known(previous: Array, queries: Array, start: int, first: Array) -> Array:
-    return np.where((queries[:, 0] < start + len(previous) // 2)[:, None], first, queries[:, 1:])
-
-
-HAND_OVER = Exercise(
-    "05.hand_over",
-    reference=hand_over,
-    cases=_hand_over_case,
-    mistakes=(
-        Mistake("whole window copied", lambda p, q, s: _known(p, q, s, p), "both windows share S / 2 frames only."),
-        Mistake(
-            "first half handed over",
-            lambda p, q, s: _known(p, q, s, np.concatenate([p[: len(p) // 2], np.repeat(p[:1], len(p) // 2, 0)])),
-            "the shared frames are the second half of the window before.",
-        ),
-        Mistake(
-            "query in the new frames",
-            lambda p, q, s: np.concatenate([p[len(p) // 2 :], np.repeat(q[None, :, 1:], len(p) // 2, 0)]),
-            "the best guess for new frames is the last known position.",
-        ),
-        Mistake(
-            "late queries forgotten",
-            lambda p, q, s: np.concatenate([p[len(p) // 2 :], np.repeat(p[-1:], len(p) // 2, 0)]),
-            "a track queried in the new half has no history: it starts at its query in all frames.",
-        ),
-        Mistake(
-            "off by one in time",
-            lambda p, q, s: np.where(
-                (q[:, 0] <= s + len(p) // 2)[:, None],
-                np.concatenate([p[len(p) // 2 :], np.repeat(p[-1:], len(p) // 2, 0)]),
-                q[:, 1:],
-            ),
-            "frame start + S / 2 is the first new one; a query there is late already.",
-        ),
-    ),
-)
-
-
-def through_virtual(points: Array, virtual: Array, **slip: object) -> tuple[Array, Array]:
-    """Points (N, D) and virtual tracks (V, D) after gather, mix and scatter, all matrices the identity."""
-
-    def look(x: Array, y: Array) -> Array:
-        scores = x @ y.T / (1 if slip.get("unscaled") else np.sqrt(x.shape[-1]))
-        return (0 if slip.get("alone") else x) + softmax(scores, slip.get("axis", -1)) @ y
-
-    gathered = look(virtual, points)
-    mixed = gathered if slip.get("unmixed") else look(gathered, gathered)
-    return look(points, virtual if slip.get("old") else mixed), mixed
-
-
-def _virtual(**slip: object) -> Callable[..., tuple[Array, Array]]:
-    return lambda points, virtual: through_virtual(points, virtual, **slip)
-
-
-VIRTUAL = Exercise(
-    "05.virtual",
-    reference=through_virtual,
-    cases=lambda rng, size: (rng.normal(size=(size + 3, size + 1)), rng.normal(size=(size + 1, size + 1))),
-    mistakes=(
-        Mistake("not mixed", _virtual(unmixed=True), "between reading and writing, virtual tracks look at each other."),
-        Mistake("old virtual tracks", _virtual(old=True), "points look at what the virtual tracks have learnt by now."),
-        Mistake("missing residual", _virtual(alone=True), "what is seen is added: x + ..."),
-        Mistake("missing scale", _virtual(unscaled=True), "divide the scores by sqrt(D) before the softmax."),
-        Mistake("softmax over the wrong axis", _virtual(axis=0), "each ROW of the weights sums to one."),
-    ),
-)
-
-
-def both_directions(forward: Array, flipped: Array, times: Array) -> tuple[Array, Array]:
-    """Query frames in the reversed clip (N,), and tracks (T, N, 3) joined from passes in both directions."""
-    frames = len(forward)
-    before = np.arange(frames)[:, None] < times
-    return frames - 1 - times, np.where(before[..., None], flipped[::-1], forward)
-
-
-def _joined(forward: Array, flipped: Array, before: Array) -> Array:
-    return np.where(before[..., None], flipped, forward)
-
-
-def _frames(x: Array) -> Array:
-    return np.arange(len(x))[:, None]
-
-
-BACKWARD = Exercise(
-    "05.backward",
-    reference=both_directions,
-    cases=lambda rng, size: (
-        *rng.normal(size=(2, size + 3, size + 1, 3)),
-        rng.integers(1, size + 2, size + 1),
-    ),
-    mistakes=(
-        Mistake(
-            "off by one in time",
-            lambda f, b, t: (len(f) - t, both_directions(f, b, t)[1]),
-            "the last frame, T - 1, becomes frame 0.",
-        ),
-        Mistake(
-            "not flipped back",
-            lambda f, b, t: (len(f) - 1 - t, _joined(f, b, _frames(f) < t)),
-            "row 0 of the second pass is the clip's last frame; reverse it.",
-        ),
-        Mistake(
-            "query frame from the wrong pass",
-            lambda f, b, t: (len(f) - 1 - t, _joined(f, b[::-1], _frames(f) <= t)),
-            "only frames BEFORE the query come from the pass backward.",
-        ),
-        Mistake(
-            "sides exchanged",
-            lambda f, b, t: (len(f) - 1 - t, _joined(f, b[::-1], _frames(f) > t)),
-            "from the query on the forward pass counts.",
-        ),
-    ),
-)
-
-EXERCISES = (TOKEN, WINDOWS, HAND_OVER, VIRTUAL, BACKWARD)
+EXERCISES = (TOKEN, GROUP, WINDOWS, HAND_OVER, BACKWARD)

@@ -11,13 +11,27 @@ import numpy as np
 from IPython.display import display
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from lessons.checker import check
-from lessons.guesses import reveal
 from lessons.milestone import milestone
-from lessons.n06_augmentations import before_and_after, motion_paths
+from lessons.n06_augmentations import TITLES, augmented, before_and_after, motion_paths
 from lessons.n06_chain import Chain
 from lessons.n06_exercises import EXERCISES
+from lessons.n06_judge import (
+    controls_figure,
+    error_figure,
+    errors,
+    frozen,
+    grey,
+    lives_on,
+    memory_figure,
+    ratio,
+    reveal,
+    verdict,
+)
+from lessons.n06_setting import SMALL, follow, gpu_setting, judged_by, large_scene, setting, small_scene
+from lessons.n06_step import apart, double, example, gradients, parts, training_step
 from lessons.pictures import pipeline, show
 from lessons.progress import collect, in_use, progress, reset
 from lessons.saved_bytes import SavedBytes
@@ -25,7 +39,7 @@ from lessons.widgets import explore
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures import png_bytes
 from tapip3d_lite.figures.curves import Line, learning_curves
-from tapip3d_lite.figures.flat import MOVING, STILL, check_drawable, draw_image
+from tapip3d_lite.figures.flat import check_drawable, draw_image
 from tapip3d_lite.geometry import project
 from tapip3d_lite.lab.train import interruptible
 from tapip3d_lite.training.run_folder import read_log
@@ -33,24 +47,51 @@ from tapip3d_lite.training.trainer import Trainer
 
 __all__ = [
     "EXERCISES",
+    "SMALL",
+    "TITLES",
     "Chain",
     "SavedBytes",
+    "apart",
+    "augmented",
     "before_and_after",
     "check",
     "collect",
+    "controls_figure",
+    "double",
+    "error_figure",
+    "errors",
+    "example",
     "explore",
+    "follow",
+    "frozen",
+    "gpu_setting",
+    "gradients",
+    "grey",
     "in_use",
+    "judged_by",
+    "large_scene",
     "learning_curve",
+    "lives_on",
+    "memory_figure",
     "milestone",
     "motion_paths",
+    "parts",
     "pipeline",
     "progress",
+    "ratio",
     "reset",
     "reveal",
+    "setting",
     "show",
+    "small_scene",
     "tracks_and_truth",
     "train_live",
+    "train_unseen",
+    "training_step",
+    "verdict",
 ]
+
+_TRUTH, _LEARNT, _MISS, _STILL = "#009e73", "#d55e00", "#f0e442", "#56b4e9"  # of Okabe and Ito
 
 
 def learning_curve(lines: Sequence[Line], zero_motion: Mapping[str, float] | None = None) -> Figure:
@@ -78,13 +119,20 @@ def tracks_and_truth(clip: Clip, pred: Tracks, frames: Sequence[int] | None = No
         raise ValueError(f"tracks_and_truth: expected true tracks of the same queries in clip {clip.name!r}")
     last = len(clip) - 1
     frames = [last // 3, 2 * last // 3, last] if frames is None else list(frames)
-    figure = Figure(figsize=(3.1 * len(frames), 6.2), layout="constrained")
+    figure = Figure(figsize=(3.4 * len(frames), 7.2), layout="constrained")
     axes = figure.subplots(2, len(frames), squeeze=False)
     for column, t in enumerate(frames):
         check_drawable(clip, frame=t)
         for ax, tracks, word in ((axes[0, column], clip.tracks, "truth"), (axes[1, column], pred, "learnt")):
             draw_image(ax, clip.video[t], f"{word} · frame {t}")
             _moves(ax, clip, tracks, t, clip.tracks if tracks is pred else None)
+    marks = [
+        Line2D([], [], marker="o", ls="", color=_TRUTH, mec="white", label="moving point, where it is"),
+        Line2D([], [], marker="s", ls="", color=_LEARNT, mec="white", label="moving point, where the tracker says"),
+        Line2D([], [], color=_MISS, lw=2, label="what it misses by"),
+        Line2D([], [], marker="^", ls="", color=_STILL, mec="white", label="point at rest"),
+    ]
+    figure.legend(handles=marks, loc="outside lower center", ncols=2, frameon=True, facecolor="#8a919c", fontsize=9)
     return figure
 
 
@@ -169,19 +217,33 @@ async def train_live(
     return live.lines
 
 
+async def train_unseen(trainer: Trainer) -> int:
+    """Train to the end without showing how it goes, since a guess is sealed; returns the number of steps of tracking.
+
+    Stop by "Kernel, Interrupt": the training then ends where it is.
+    """
+    with interruptible() as interrupted:
+        count = 0
+        for line in trainer.steps(interrupted):
+            count += line["stage"] == "tracking"
+            await asyncio.sleep(0)
+    return count
+
+
 def _moves(ax: Axes, clip: Clip, tracks: Tracks, t: int, truth: Tracks | None) -> None:
     """Paths in the world from each query to frame t, seen by the camera of frame t; moving points that it shows."""
     mask = clip.tracks.visible[t] & (clip.tracks.queries[:, 0] <= t)
     dynamic = np.ones(len(mask), bool) if clip.tracks.dynamic is None else clip.tracks.dynamic
     camera = [np.repeat(x[t : t + 1], t + 1, 0) for x in (clip.intrinsics, clip.extrinsics)]
+    color, mark = (_TRUTH, "o") if truth is None else (_LEARNT, "s")
     for n in np.flatnonzero(mask & dynamic):
         start = int(clip.tracks.queries[n, 0])
         uv = project(tracks.xyz[start : t + 1, n : n + 1], *(x[start:] for x in camera))[0][:, 0]
         ax.plot(*uv.T, color="white", lw=0.8, alpha=0.8)
-        ax.plot(*uv[-1], "o", color=MOVING, ms=3.5, mec="white", mew=0.4)
         if truth is not None:
             goal = project(truth.xyz[t, n][None, None], camera[0][:1], camera[1][:1])[0][0, 0]
-            ax.plot([uv[-1, 0], goal[0]], [uv[-1, 1], goal[1]], color="#ffd23f", lw=1.2)
+            ax.plot([uv[-1, 0], goal[0]], [uv[-1, 1], goal[1]], color=_MISS, lw=1.6)
+        ax.plot(*uv[-1], mark, color=color, ms=4.5, mec="white", mew=0.5)
     still = mask & ~dynamic
     uv = project(tracks.xyz[t : t + 1, still], camera[0][:1], camera[1][:1])[0][0]
-    ax.plot(*uv.T, "o", color=STILL, ms=2.5, mec="white", mew=0.3)
+    ax.plot(*uv.T, "^", color=_STILL, ms=4, mec="white", mew=0.3)

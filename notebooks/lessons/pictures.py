@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import re
 
 from IPython.display import display
 from matplotlib.figure import Figure
@@ -91,18 +92,20 @@ def pipeline(lesson: str) -> Shown:
         on = number == lesson
         ax.add_patch(FancyBboxPatch((x - 0.42, y - 0.22), 0.84, 0.44, boxstyle="round,pad=0.02,rounding_size=0.08",
                                     fc=_LIT if on else _PALE, ec=_INK, lw=1.6 if on else 0.6, zorder=2))  # fmt: skip
-        ax.text(x, y, name, ha="center", va="center", fontsize=8.5, color=_INK, zorder=3, weight="bold" if on else None)
+        ax.text(x, y, name, ha="center", va="center", fontsize=8.5, color=_INK, zorder=3)
         ax.text(
             x + 0.4 if y > 1.2 else x,
             y - 0.38,
             number,
             ha="center",
             va="center",
-            fontsize=7.5,
+            fontsize=8,
             color="#57606a",
             zorder=3,
         )
-    words = ", ".join(" ".join(name.replace("$", "").replace("\\mathcal{C}^l", "C").split()) for name in lit)
+    words = "; ".join(
+        re.sub(r"\n(.*)", r" (\1)", re.sub(r"\$(?:\\mathcal\{)?(\w)[^$]*\$", r"\1", name)) for name in lit
+    )
     alt = (
         "The method from left to right: frames with depth and cameras; encoder and lifting side by side; world space; "
     )

@@ -211,7 +211,9 @@ def write_pack(notebooks: Path, out: Path, lesson: int = 45) -> list[Path]:
     loaded |= {f"{folder}/lessons": notebooks / "lessons" for folder in ("student", "solution")}
     for name, source in loaded.items():
         if source.is_dir():
-            shutil.copytree(source, out / name, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)
+            shutil.copytree(
+                source, out / name, ignore=shutil.ignore_patterns("__pycache__", "answers"), dirs_exist_ok=True
+            )
     return list(files)
 
 

@@ -1,6 +1,6 @@
 """`Frames`: a batch of posed RGB-D videos as tensors, and how a clip is brought to the model's image size.
 
-    u' = (u + 1/2) W' / W - 1/2,   depth' = resized depth / resized validity
+    u' = (u + 1/2) W' / W - 1/2,   depth' = resized depth / resized validity, or the nearest
 
 Paper: section 3.2 (the input). The released code moves the camera otherwise than the image (`TrackerConfig.corners`).
 """
@@ -16,6 +16,8 @@ from torch import Tensor
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import resize_intrinsics
+
+_STEP = 0.02  # relative difference of depth from which a silhouette lies between two pixels
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def resize_clip(clip: Clip, size: tuple[int, int], corners: bool = False) -> Cli
     """The clip's frames at another image size, without its queries and tracks.
 
     Colours are interpolated linearly. Depth is interpolated over valid pixels only, that is divided by the
-    interpolated validity, and stays invalid where fewer than half of the weights are valid.
+    interpolated validity; across a silhouette it is the nearest pixel's; it is invalid where half of the weights are.
 
     Args:
         clip: T frames of any size.
@@ -116,6 +118,7 @@ def resize_clip(clip: Clip, size: tuple[int, int], corners: bool = False) -> Cli
 
 def _resize_depth(depth: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     valid = (depth > 0).astype(np.float32)
-    share = cv2.resize(valid, shape, interpolation=cv2.INTER_LINEAR)
-    value = cv2.resize(depth, shape, interpolation=cv2.INTER_LINEAR)
-    return np.where(share > 0.5, value / np.maximum(share, 1e-6), np.float32(0))
+    share, value = (cv2.resize(x, shape, interpolation=cv2.INTER_LINEAR) for x in (valid, depth))
+    mean, nearest = value / np.maximum(share, 1e-6), cv2.resize(depth, shape, interpolation=cv2.INTER_NEAREST_EXACT)
+    mixed = (nearest > 0) & (np.abs(mean - nearest) > _STEP * nearest)  # of front and back, a point on neither
+    return np.where(share > 0.5, np.where(mixed, nearest, mean), np.float32(0))
