@@ -88,7 +88,7 @@ def survivors(number, seconds=10):
     """(exercise, change, code) of each mutant of a lesson's solutions that its checker lets pass; and how many there were."""
     path = next((ROOT / "notebooks").glob(f"{number}_*.ipynb"))
     notebook, found, count = read_notebook(path), [], 0
-    names = {function_name(path, exercise.name): exercise for exercise in exercises_of(number)}
+    names = {function_name(notebook, exercise.name): exercise for exercise in exercises_of(number)}
     space = _imports(notebook)
     for i in stubs(notebook):
         solution = solution_of(notebook, i)

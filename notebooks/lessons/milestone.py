@@ -10,7 +10,7 @@ two right orders of summation could give different tracks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
@@ -51,15 +51,20 @@ def milestone(
     apart = max(float(np.abs(xyz - _library(*form)).max()) for form, xyz in mine.items())
     where = f", in the spaces {', '.join(map(str, spaces))}" if spaces != (None,) else ""
     where += f", with the neighbourhoods {', '.join(map(str, neighborhoods))}" if neighborhoods != (None,) else ""
-    lines = [f"{len(calls)} functions in the tracker; tracks of {_POINTS} points over {_FRAMES} frames{where}"]
-    for name, count in calls.items():
-        whose = "yours" if progress.is_yours(name) else "the reference, until yours passes"
-        lines.append(f"  {name}: {whose}, called {count} times")
-    lines.append(f"largest distance from the library's tracks: {1000 * apart:.4f} mm")
-    if not apart < _METRES or 0 in calls.values():
-        return Verdict("wrong", "\n".join(lines))
-    whole = all(progress.is_yours(name) for name in calls)
-    return Verdict("passed" if whole else "not attempted", "\n".join(lines))
+    opening = f"{len(calls)} functions in the tracker; tracks of {_POINTS} points over {_FRAMES} frames{where}"
+    return report(calls, apart < _METRES, opening, f"largest distance from the library's tracks: {1000 * apart:.4f} mm")
+
+
+def report(calls: Mapping[str, int], agrees: bool, opening: str, closing: str) -> Verdict:
+    """What a milestone says: whose each function is and how often it was called, between an opening and a closing line.
+
+    Passed: all are the learner's, the library called each, and the result agrees with the library's.
+    """
+    rows = [f"  {name}: {progress.whose(name)}, called {count} times" for name, count in calls.items()]
+    message = "\n".join([opening, *rows, closing])
+    if not agrees or 0 in calls.values():
+        return Verdict("wrong", message)
+    return Verdict("passed" if all(map(progress.is_yours, calls)) else "not attempted", message)
 
 
 class plugged:
@@ -70,8 +75,8 @@ class plugged:
         calls: is filled with the number of calls of each exercise's function.
     """
 
-    def __init__(self, lessons: tuple[str, ...], calls: dict[str, int] | None = None) -> None:
-        self.calls = {} if calls is None else calls
+    def __init__(self, lessons: tuple[str, ...], calls: dict[str, int]) -> None:
+        self.calls = calls
         self.places: dict[str, object] = {}
         modules = [import_module(f"lessons.n{lesson}") for lesson in lessons]
         for module in modules:

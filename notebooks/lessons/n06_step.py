@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lessons import progress
-from lessons.milestone import Use, plugged
+from lessons.milestone import Use, plugged, report
 from lessons.verdict import Verdict
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.model.frames import Frames
@@ -193,15 +192,9 @@ def training_step(tracker: Tracker, clip: Clip) -> Verdict:
     with plugged(("06",), calls):
         mine = gradients(place.add_gradients, tracker, batch, iterations=_UPDATES)
     difference = apart(mine, theirs)
-    lines = [f"one training step, two windows of {_UPDATES} updates, on {len(calls)} functions"]
-    for name, count in calls.items():
-        whose = "yours" if progress.is_yours(name) else "the reference, until yours passes"
-        lines.append(f"  {name}: {whose}, called {count} times")
-    lines.append(f"gradients of {len(theirs)} parameter tensors, encoder included: largest difference {difference:.1e}")
-    if not difference < _AGREE or 0 in calls.values():
-        return Verdict("wrong", "\n".join(lines))
-    whole = all(progress.is_yours(name) for name in calls)
-    return Verdict("passed" if whole else "not attempted", "\n".join(lines))
+    opening = f"one training step, two windows of {_UPDATES} updates, on {len(calls)} functions"
+    closing = f"gradients of {len(theirs)} parameter tensors, encoder included: largest difference {difference:.1e}"
+    return report(calls, difference < _AGREE, opening, closing)
 
 
 def replace_precision(tracker: Tracker) -> Tracker:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import ast
 import contextlib
 import io
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lessons.teaching import Notebook, read_notebook, tags
 from lessons.verdict import Verdict
 
 Answer = Callable[..., object]
@@ -45,13 +45,18 @@ def in_use(name: str, quiet: bool = False) -> Answer:
 
     entry, exercise = _ENTRIES.get(name, _Entry()), find(name)
     if not quiet:
-        print(f"{name}: {'yours' if entry.answer else 'the reference, until yours passes'}")
+        print(f"{name}: {whose(name)}")
     return entry.answer or exercise.reference
 
 
 def is_yours(name: str) -> bool:
     """Whether `in_use` gives the learner's function."""
     return name in _ENTRIES and _ENTRIES[name].answer is not None
+
+
+def whose(name: str) -> str:
+    """Whose function `in_use` gives, in words."""
+    return "yours" if is_yours(name) else "the reference, until yours passes"
 
 
 def progress(*lessons: str) -> Verdict:
@@ -98,9 +103,10 @@ def collect(folder: str | Path = ".", lessons: tuple[str, ...] = ()) -> Verdict:
         if lessons and path.stem[:2] not in lessons:
             continue
         found.append(path.stem[:2])
-        space = _exercise_cells(path)
+        notebook = read_notebook(path)
+        space = _exercise_cells(notebook, path.name)
         for exercise in exercises_of(path.stem[:2]):
-            answer = space.get(function_name(path, exercise.name))
+            answer = space.get(function_name(notebook, exercise.name))
             if callable(answer) and not is_yours(exercise.name):
                 verdict = judge(exercise, answer)
                 if verdict.status != "not attempted":
@@ -108,22 +114,22 @@ def collect(folder: str | Path = ".", lessons: tuple[str, ...] = ()) -> Verdict:
     return progress(*found)
 
 
-def function_name(path: Path, exercise: str) -> str:
+def function_name(notebook: Notebook, exercise: str) -> str:
     """The name of the function that a notebook hands to the checker of an exercise; empty if it does not."""
-    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
-        source = "".join(cell["source"])
+    for cell in notebook["cells"]:
+        source = cell["source"]
         if cell["cell_type"] == "code" and f'check("{exercise}"' in source:
             return source.split(f'check("{exercise}",')[1].split(")")[0].strip()
     return ""
 
 
-def _exercise_cells(path: Path) -> dict[str, object]:
+def _exercise_cells(notebook: Notebook, name: str) -> dict[str, object]:
     space: dict[str, object] = {}
-    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
-        source, tags = "".join(cell["source"]), cell["metadata"].get("tags", [])
-        if cell["cell_type"] == "code" and ({"exercise", "parameters"} & set(tags) or _imports(source)):
+    for cell in notebook["cells"]:
+        source = cell["source"]
+        if cell["cell_type"] == "code" and ({"exercise", "parameters"} & set(tags(cell)) or _imports(source)):
             with contextlib.suppress(Exception), contextlib.redirect_stdout(io.StringIO()):
-                exec(compile(source, path.name, "exec"), space)
+                exec(compile(source, name, "exec"), space)
     return space
 
 
