@@ -126,7 +126,7 @@ def official_config(cfg: Mapping[str, Any]) -> TrackerConfig:
         raise ValueError(f"cfg.model: unknown options {', '.join(sorted(flat))}; they might change the numbers")
     size = cfg["model"].get("image_size") or cfg.get("train_dataset", {}).get("resolution") or (384, 512)
     # The released updater's heads are 48 wide, whatever its width.
-    return TrackerConfig(image_size=tuple(size), corners=True, space="world", head_dim=48, **ours)
+    return TrackerConfig(image_size=tuple(size), as_released=True, space="world", head_dim=48, **ours)
 
 
 def parameter_names(tracker: Tracker) -> dict[str, str]:

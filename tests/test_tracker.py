@@ -59,18 +59,18 @@ def test_windows_overlap_by_half(frames, ends):
     assert list(window_ends(frames, 8)) == ends
 
 
-@pytest.mark.parametrize("count", [1, 2, 4, 6, 8])
-def test_clips_shorter_than_a_window_are_tracked_like_padded_ones(golden, count):
-    queries = golden.queries[:, golden.queries[0, :, 0] < count]
-    xyz, logits = run(golden, golden.frames.cut(0, count), queries)
-    assert not torch.equal(xyz, queries[:, None, :, 1:].expand_as(xyz)) and logits.all()
-    padded, _ = run(golden, golden.frames.cut(0, count).pad(8), queries)
-    assert torch.equal(padded[:, :count], xyz)
+def test_short_clips_have_no_window_and_return_the_query(golden):
+    queries = golden.queries[:, golden.queries[0, :, 0] < 4]
+    xyz, logits = run(golden, golden.frames.cut(0, 4), queries)
+    assert torch.equal(xyz, queries[:, None, :, 1:].expand_as(xyz))
+    assert not logits.any()
+    moved, _ = run(golden, golden.frames.cut(0, 6), queries)
+    assert not torch.equal(moved, queries[:, None, :, 1:].expand_as(moved))
 
 
 def test_padding_repeats_the_last_frame(golden):
     xyz, _ = run(golden)
-    longer, _ = run(golden, golden.frames.pad(len(golden.frames) + 2))
+    longer, _ = run(golden, golden.frames.pad(4))
     assert torch.equal(longer[:, : xyz.shape[1]], xyz)
 
 
@@ -383,7 +383,7 @@ def test_the_released_configuration_loads(size):
     cfg = {"model": RELEASED} | ({"train_dataset": {"resolution": list(size)}} if size else {})
     loaded = from_official_state(cfg, state | {"time_emb": ours.time[None]})
     assert (
-        loaded.config == ours.config.replace(corners=True) and loaded.config.heads == 8 and loaded.config.head_dim == 48
+        loaded.config == ours.config.replace(as_released=True) and loaded.config.heads == 8 and loaded.config.head_dim == 48
     )
     assert all(torch.equal(x, own[name]) for name, x in loaded.state_dict().items())
     assert sum(p.numel() for p in loaded.parameters()) == pytest.approx(25.7e6, rel=0.01)
@@ -509,7 +509,7 @@ def test_image_depth_and_camera_of_a_resized_clip_agree(size):
 
 
 def test_only_the_released_model_keeps_the_released_rule(golden, clip, monkeypatch):
-    assert golden.tracker.config.corners and not TrackerConfig().corners and not TrackerConfig.preset("lite").corners
+    assert golden.tracker.config.as_released and not TrackerConfig().as_released and not TrackerConfig.preset("lite").as_released
     tracker, larger, rules = golden.tracker, resize_clip(clip, (96, 128)), []
     for module in (track, stream):
         spy = lambda clip, size, corners: rules.append(corners) or resize_clip(clip, size, corners)  # noqa: E731
@@ -518,7 +518,7 @@ def test_only_the_released_model_keeps_the_released_rule(golden, clip, monkeypat
     xyz = []
     try:
         for corners in (True, False):
-            tracker.config = before.replace(corners=corners)
+            tracker.config = before.replace(as_released=corners)
             xyz.append(tracker.track(larger, queries, iterations=1, support_grid=0, bidirectional=False).xyz)
             online = tracker.stream(queries, iterations=1, support_grid=0)
             online.push(larger.video[0], larger.depths[0], larger.intrinsics[0], larger.extrinsics[0])

@@ -32,7 +32,8 @@ class TrackerConfig:
         context: what it makes of them; a name or a `n2n.Context`, as a class or a module.
         updater: how trajectories are corrected; a name or a module (see `updater.Transformer`), as a class or a module.
         image_size: (H, W) pixels that the tracker works at.
-        corners: resized clips get the released code's intrinsics, up to |1 - W'/W| / 2 px beside the image; ours follow it.
+        as_released: resized clips get intrinsics up to |1 - W'/W| / 2 px beside the image, and logits alone make points
+            visible, as in the released code.
         window: S frames that are solved together, even; the next window starts S / 2 later.
         feature_dim: C, channels of the feature map.
         stride: pixels per feature cell.
@@ -69,7 +70,7 @@ class TrackerConfig:
     context: Part = "n2n"
     updater: Part = "transformer"
     image_size: tuple[int, int] = (384, 512)
-    corners: bool = False
+    as_released: bool = False
     window: int = 16
     feature_dim: int = 128
     stride: int = 4

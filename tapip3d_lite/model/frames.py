@@ -2,7 +2,7 @@
 
     u' = (u + 1/2) W' / W - 1/2,   depth' = resized depth / resized validity, or the nearest
 
-Paper: section 3.2 (the input). The released code moves the camera otherwise than the image (`TrackerConfig.corners`).
+Paper: section 3.2 (the input). The released code moves the camera otherwise than the image (`TrackerConfig.as_released`).
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ class Frames:
         """The same frames backward in time."""
         return self._map(lambda x: x.flip(1))
 
-    def pad(self, count: int) -> Frames:
-        """Repeat the last frame until there are so many; the repeats count like any frame."""
-        extra = count - len(self)
+    def pad(self, multiple: int) -> Frames:
+        """Repeat the last frame until the number of frames is a multiple; the repeats count like any frame."""
+        extra = -len(self) % multiple
         return self if extra == 0 else self._map(lambda x: torch.cat([x, x[:, -1:].expand(-1, extra, *x.shape[2:])], 1))
 
     def to(self, device: torch.device | str) -> Frames:
@@ -113,6 +113,20 @@ def resize_clip(clip: Clip, size: tuple[int, int], corners: bool = False) -> Cli
     video = np.stack([cv2.resize(image, shape, interpolation=cv2.INTER_LINEAR) for image in clip.video])
     depths = np.stack([_resize_depth(depth, shape) for depth in clip.depths])
     intrinsics = resize_intrinsics(clip.intrinsics, clip.size, size, corners)
+    return Clip(video, depths, intrinsics, clip.extrinsics, fps=clip.fps)
+
+
+def crop_clip(clip: Clip, box: tuple[int, int, int, int]) -> Clip:
+    """The pixels (left, top, right, bottom) of the clip's frames, without its queries and tracks; right and bottom lie outside.
+
+    A box without pixels, or one that leaves the image, is a ValueError.
+    """
+    left, top, right, bottom = box
+    if not (0 <= left < right <= clip.size[1] and 0 <= top < bottom <= clip.size[0]):
+        raise ValueError(f"crop: expected (left, top, right, bottom) inside {clip.size[1]}x{clip.size[0]}, got {box}")
+    intrinsics = clip.intrinsics.copy()
+    intrinsics[:, :2, 2] -= (left, top)
+    video, depths = (x[:, top:bottom, left:right] for x in (clip.video, clip.depths))
     return Clip(video, depths, intrinsics, clip.extrinsics, fps=clip.fps)
 
 

@@ -16,12 +16,11 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip, Tracks
-from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.spaces import fitted
-from tapip3d_lite.model.track import check_options
-from tapip3d_lite.model.windows import Scene, State, Step, padded
+from tapip3d_lite.model.track import check_options, visibility
+from tapip3d_lite.model.windows import Scene, State, Step
 from tapip3d_lite.queries import grid_queries
 from tapip3d_lite.validate import floats
 
@@ -90,7 +89,7 @@ class Stream:
             ValueError: arrays that do not fit, as for `Clip`.
         """
         clip = Clip(image[None], depth[None], np.asarray(intrinsics)[None], np.asarray(extrinsics)[None])
-        clip = resize_clip(clip, self.tracker.config.image_size, self.tracker.config.corners)
+        clip = resize_clip(clip, self.tracker.config.image_size, self.tracker.config.as_released)
         frames = frames_from_clip(clip, device=self.rows.device)
         if self.seen == 0:
             self.space = fitted(self.space, frames)
@@ -102,8 +101,8 @@ class Stream:
     @torch.no_grad()
     def finish(self) -> Tracks:
         """The last frame is repeated to complete a window, as offline; returns the tracks of all frames."""
-        real = self.seen
-        for _ in range(padded(real, self.tracker.config.window) - real if real else 0):
+        real, size = self.seen, self.tracker.config.window
+        while self.seen and (self.seen < size or self.seen % (size // 2)):
             self._push(*self.window[-1])
         return self._tracks(0, real)
 
@@ -162,15 +161,14 @@ class Stream:
     def _tracks(self, start: int, stop: int) -> Tracks:
         count, state = len(self.queries), self.state  # without the support grid
         logits = state.logits[0, start:stop, :count].cpu().numpy()
-        visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= self.threshold
-        visible &= np.arange(start, stop)[:, None] >= self.queries[:, 0]  # there is no pass backward
-        xyz = np.zeros((stop - start, count, 3), np.float32)
+        xyz, visible = np.zeros((stop - start, count, 3), np.float32), logits > 0
         if stop > start:
             cameras = [torch.cat(parts, 1) for parts in zip(*self.cameras[start:stop], strict=True)]
             with torch.autocast(self.rows.device.type, enabled=False):
-                world = self.space.to_world(state.coords[:, start:stop, :count], *cameras)
-                visible &= in_image(world, *cameras[:2], self.tracker.config.image_size)[0].cpu().numpy()
-            xyz = world[0].cpu().numpy()
+                xyz = self.space.to_world(state.coords[:, start:stop, :count], *cameras)[0].cpu().numpy()
+            begun = np.arange(start, stop)[:, None] >= self.queries[:, 0]  # there is no pass backward
+            seen_by = (x[0].cpu().numpy() for x in cameras[:2])
+            visible = visibility(logits, self.threshold, xyz, *seen_by, begun, self.tracker.config)
         future = self.queries[:, 0] >= self.seen  # known to the world, but not yet to a camera
         return Tracks(np.where(future[:, None], self.queries[:, 1:], xyz), visible, self.queries, logits)
 

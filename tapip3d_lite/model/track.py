@@ -1,7 +1,7 @@
 """Tracking one clip as a user wants it: any image size, both directions in time, helped by a grid of other points.
 
     forward pass  from t = 0 on;  backward pass on the reversed clip, for the frames before each query
-    visible       sigmoid(v) >= threshold, inside the image, and not before the query without a backward pass
+    visible       sigmoid(v) >= threshold, inside the image, and not before a query that is only tracked forward
 
 Paper: section 4 (protocol: a grid of support queries, a second pass backward in time); the region of interest of depth
 is the released code's.
@@ -9,6 +9,7 @@ is the released code's.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from functools import partial
@@ -21,8 +22,8 @@ from torch import Tensor, nn
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
-from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
-from tapip3d_lite.model.windows import padded, window_ends
+from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.frames import Frames, crop_clip, frames_from_clip, resize_clip
 from tapip3d_lite.queries import grid_queries, resolve_queries
 
 _KEPT = 2**27  # floats of features kept for a whole clip (512 MiB); of longer clips only a window's are
@@ -40,6 +41,8 @@ def track(
     bidirectional: bool = True,
     depth_roi: str | tuple[float, float] | None = "auto",
     visible_threshold: float | None = None,
+    size: tuple[int, int] | None = None,
+    crop: tuple[int, int, int, int] | None = None,
     progress: bool = False,
 ) -> Tracks:
     """Track points through a clip.
@@ -59,6 +62,9 @@ def track(
             whatever the first window that contains it says.
         depth_roi: depths (near, far) that count for the scale; `"auto"`: up to q75 + 1.5 IQR of the clip; None: all.
         visible_threshold: a point inside the image is visible from this probability on; the config's if None.
+        size: (H, W) to resize images to, in place of the size that the tracker was trained at.
+        crop: (left, top, right, bottom), the pixels that are looked at; what lies outside is hidden. A small object
+            gains from it.
         progress: show a bar.
 
     Returns:
@@ -69,26 +75,52 @@ def track(
     """
     support_grid = tracker.config.support_grid if support_grid is None else support_grid
     threshold = check_options(tracker, space, depth_roi, visible_threshold, support_grid)
-    queries = resolve_queries(clip, queries)
-    clip = resize_clip(clip, tracker.config.image_size, tracker.config.corners)
+    if size is not None:
+        tracker = copy.copy(tracker)  # with the same weights
+        tracker.config = tracker.config.replace(image_size=size)
+    queries, count = resolve_queries(clip, queries), len(clip)
+    clip = _prepared(clip, tracker.config, crop)
     roi = quantile_roi(torch.from_numpy(clip.depths)) if isinstance(depth_roi, str) else depth_roi
     options = {"iterations": iterations, "space": space, "depth_roi": roi}
     grids = [_grid(clip, support_grid, frame) for frame in (0, len(clip) - 1)]
     backward = bidirectional and bool((queries[:, 0] > 0).any())
-    ways = _ways(tracker, clip)
+    ways, begun = _ways(tracker, clip), np.arange(len(clip))[:, None] >= queries[:, 0]  # (T, N)
     with _bar(progress, tracker, len(clip), iterations, 1 + backward) as bar:
         options["watch"] = lambda _: bar.update()
         xyz, logits = _one_way(ways[0], queries, grids[0], options)
         if backward:
             flipped = [_flip_time(rows, len(clip)) for rows in (queries, grids[1])]
             other = _one_way(ways[1], *flipped, options)
-            before = np.arange(len(clip))[:, None] < queries[:, 0]  # (T, N)
-            xyz = np.where(before[..., None], other[0][::-1], xyz)
-            logits = np.where(before, other[1][::-1], logits)
-    asked = bidirectional | (np.arange(len(clip))[:, None] >= queries[:, 0])  # (T, N)
-    visible = asked & (1 / (1 + np.exp(-logits.astype(np.float64))) >= threshold)
-    visible &= in_image(xyz, clip.intrinsics, clip.extrinsics, clip.size)
-    return Tracks(xyz, visible, queries, logits)
+            xyz = np.where(begun[..., None], xyz, other[0][::-1])
+            logits = np.where(begun, logits, other[1][::-1])
+    cameras = clip.intrinsics, clip.extrinsics
+    visible = visibility(logits, threshold, xyz, *cameras, bidirectional | begun, tracker.config)
+    return Tracks(xyz[:count], visible[:count], queries, logits[:count])
+
+
+def visibility(
+    logits: np.ndarray,
+    threshold: float,
+    xyz: np.ndarray,
+    intrinsics: np.ndarray,
+    extrinsics: np.ndarray,
+    tracked: np.ndarray,
+    config: TrackerConfig,
+) -> np.ndarray:
+    """Which of the points (T, N, 3) are visible: by their logits, and unless `as_released` also in the image and `tracked`."""
+    visible = 1 / (1 + np.exp(-logits.astype(np.float64))) >= threshold
+    if config.as_released:
+        return visible
+    return visible & tracked & in_image(xyz, intrinsics, extrinsics, config.image_size)
+
+
+def _prepared(clip: Clip, config: TrackerConfig, crop: tuple[int, int, int, int] | None) -> Clip:
+    """The clip as the model takes it; one that is too short for a window repeats its last frame until there is one."""
+    clip = resize_clip(clip if crop is None else crop_clip(clip, crop), config.image_size, config.as_released)
+    if len(clip) > config.window // 2:
+        return clip
+    index = np.arange(config.window).clip(max=len(clip) - 1)
+    return Clip(*(x[index] for x in (clip.video, clip.depths, clip.intrinsics, clip.extrinsics)))
 
 
 def _ways(tracker: nn.Module, clip: Clip) -> list[Callable[..., tuple[np.ndarray, np.ndarray]]]:
@@ -138,7 +170,7 @@ def _flip_time(rows: np.ndarray, frames: int) -> np.ndarray:
 def _bar(show: bool, tracker: nn.Module, frames: int, iterations: int | None, passes: int) -> Any:
     from tqdm.auto import tqdm
 
-    windows = len(window_ends(padded(frames, tracker.config.window), tracker.config.window))
+    windows = -(-frames // (tracker.config.window // 2)) - 1
     total = windows * (iterations or tracker.config.iterations) * passes
     return tqdm(total=total, disable=not show, desc="tracking")
 

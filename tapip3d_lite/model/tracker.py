@@ -29,7 +29,7 @@ from tapip3d_lite.model.registry import make_module, make_space
 from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.stream import Stream
 from tapip3d_lite.model.updater import token_width, trajectory_tokens
-from tapip3d_lite.model.windows import Scene, State, Step, Window, padded, query_support, to_world, window_ends
+from tapip3d_lite.model.windows import Scene, State, Step, Window, query_support, to_world, window_ends
 
 _CHUNK = 2**25  # floats of context tokens that exist at once without gradient: 128 MiB
 _CPU_CHUNK = 2**21  # on a CPU 8 MiB are twice as fast, since temporaries stay in the cache
@@ -74,11 +74,11 @@ class Tracker(nn.Module):
             options: as for `steps`.
 
         Returns:
-            xyz (B, T, N, 3), world, and visibility logits (B, T, N). Before a query's first window
-            the query's position and 0.
+            xyz (B, T, N, 3), world, and visibility logits (B, T, N). Before a query's first window, and in clips of
+            at most S / 2 frames, the query's position and 0.
         """
         space = fitted(self.resolve_space(options.get("space")), frames)
-        state = State.start(queries, frames, space, self.config.window)
+        state = State.start(queries, frames, space, self.config.window // 2)
         for step in self.steps(frames, queries, state=state, **(options | {"space": space})):
             if watch is not None:
                 watch(step)
@@ -117,7 +117,7 @@ class Tracker(nn.Module):
             return
         space = fitted(self.resolve_space(space), frames)
         features = self.encoder(frames.rgb) if features is None else features
-        state = State.start(queries, frames, space, config.window, not self.sync_free) if state is None else state
+        state = State.start(queries, frames, space, config.window // 2, not self.sync_free) if state is None else state
         scene = self.scene(frames, features, space, depth_roi)
         support = self.support(scene, queries, state.queries)
         for stop in window_ends(len(scene.frames), config.window):
@@ -161,13 +161,14 @@ class Tracker(nn.Module):
     def scene(
         self, frames: Frames, features: Tensor, space: Any, depth_roi: tuple[float, float] | None, start: int = 0
     ) -> Scene:
-        """Lift T frames with features (B, T, C, h, w) to a feature cloud in `space`, padded to whole windows.
+        """Lift T frames with features (B, T, C, h, w) to a feature cloud in `space`, padded to whole half windows.
 
         `start` says which frame of the clip is the first; `depth_roi` as for `steps`.
         """
         with torch.autocast(frames.depths.device.type, enabled=False):
-            count = padded(len(frames), self.config.window)
-            padding, frames = count - len(frames), frames.pad(count)
+            half = self.config.window // 2
+            padding = -len(frames) % half
+            frames = frames.pad(half)
             if padding:
                 features = torch.cat([features, features[:, -1:].expand(-1, padding, -1, -1, -1)], 1)  # (B, T, …)
             points = space.lift(frames.depths, frames.intrinsics, frames.extrinsics)  # (B, T, H, W, 3)

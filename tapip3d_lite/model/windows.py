@@ -107,13 +107,8 @@ def to_world(coords: Tensor, frames: Frames, space: Any) -> Tensor:
 
 
 def window_ends(frames: int, window: int) -> range:
-    """Frames after the last of each window: S, S + S/2, ..."""
+    """Frames after the last of each window: S, S + S/2, ...; none if there are at most S/2 frames."""
     return range(window, frames + 1, window // 2)
-
-
-def padded(frames: int, window: int) -> int:
-    """T': T rounded up to whole half windows, and to one window (the released code gives clips of up to S/2 none)."""
-    return max(window, frames + -frames % (window // 2))
 
 
 @dataclass
@@ -121,7 +116,7 @@ class State:
     """All trajectories so far, in their space and its original units.
 
     Attributes:
-        coords: (B, T', N, 3), T' as `padded` says; starts as the query's position everywhere.
+        coords: (B, T', N, 3), T' padded to whole half windows; starts as the query's position everywhere.
         logits: (B, T', N), starts as 0.
         queries: (B, N, 3) the queries in the trajectories' space.
         times: (B, N) int64 query frames.
@@ -133,7 +128,7 @@ class State:
     times: Tensor
 
     @classmethod
-    def start(cls, queries: Tensor, frames: Frames, space: Any, window: int, check: bool = True) -> State:
+    def start(cls, queries: Tensor, frames: Frames, space: Any, multiple: int, check: bool = True) -> State:
         """Trajectories that stand still at their queries (B, N, 4), given in the world; `check` their frames or not."""
         if queries.ndim != 3 or queries.shape[0] != len(frames.depths) or queries.shape[2] != 4:
             raise ValueError(
@@ -148,7 +143,7 @@ class State:
         with torch.autocast(queries.device.type, enabled=False):
             cameras = frames.intrinsics[batch, times], frames.extrinsics[batch, times]  # (B, N, ...)
             coords = space.from_world(queries[..., None, 1:], *cameras)[:, :, 0]
-        count = padded(len(frames), window)
+        count = len(frames) + -len(frames) % multiple
         still = coords[:, None].expand(-1, count, -1, -1).clone()  # (B, N, 3) -> (B, T', N, 3)
         return cls(still, still.new_zeros(still.shape[:3]), coords, times)
 
