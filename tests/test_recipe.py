@@ -23,7 +23,7 @@ from tests.tiny import SIZES, checkpoint, recipe
 PAPER = {
     "clips": 10_000, "steps": 200_000, "batch": 1, "frames": (24, 24), "iterations": (4, 4), "short": 0.0,
     "train_encoder": True, "augment": True, "lr": 5e-4, "weight_decay": 5e-4, "warmup": 0.05, "clip_norm": 10.0,
-    "precision": "bfloat16", "minutes": None, "init": None, "sensor": 0.0,
+    "precision": "bfloat16", "minutes": None, "init": None, "sensor": 0.0, "average": 0,
     "loss": {"form": "paper", "visibility": 3.0, "discount": 0.8, "scale": 0.005, "soften": 0.0, "within": 0.0},
     "motion": {
         "world": 0.0, "turned": 0.0, "still": 0.0, "velocity": 0.03, "velocity_noise": 0.015, "rotation": 0.1,
@@ -43,7 +43,7 @@ PAPER = {
 LITE = {
     "clips": 1000, "steps": 6000, "matching_steps": 2500, "batch": 1, "frames": (8, 16), "iterations": (2, 3),
     "short": 0.35, "train_encoder": False, "augment": False, "lr": 1e-3, "weight_decay": 5e-4, "warmup": 0.05,
-    "clip_norm": 10.0, "precision": "float32",
+    "clip_norm": 10.0, "precision": "float32", "average": 1000, "sensor": 0.4,
     "loss": {"form": "pixels", "visibility": 0.5, "discount": 0.8, "scale": 0.005, "soften": 0.0, "within": 0.0},
     "sampling": {"tracks": 48, "seen": 0.2, "anywhere": 0.25, "backward": 0.5},
     "matching": {

@@ -16,6 +16,7 @@ import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
 from tapip3d_lite.files import load_npz
 from tapip3d_lite.lab import make_trainer
+from tapip3d_lite.model.weights import load_weights
 from tapip3d_lite.training.augment import AugmentConfig
 from tapip3d_lite.training.data import FeatureCache, SamplingConfig, pick_frames
 from tapip3d_lite.training.motion import MotionConfig
@@ -47,6 +48,34 @@ def test_continuing_after_a_kill_changes_no_bit(tmp_path, clips, one_thread):
     assert t3d.load_tracker(tmp_path / "killed" / "weights.safetensors").config.window == 4
 
 
+@pytest.mark.parametrize("span", [5, 1000])
+def test_the_saved_weights_are_the_average_of_the_last(tmp_path, clips, span):
+    """Against the recursion written out: 1 / span, or 10 / (step + 9) while that is more; so the first weights vanish."""
+    trainer, mean = Trainer(tmp_path / "run", recipe(average=span), clips), None
+    scored = []
+    trainer.validate = lambda tracker: scored.append(weights_of(tracker)) or {}
+    for line in trainer.steps():
+        share = max(1 / span, 10 / (line["step"] + 9))
+        new = weights_of(trainer.tracker).double()
+        mean = new if mean is None else mean + share * (new - mean)
+    assert torch.allclose(weights_of(trainer.average).double(), mean, atol=1e-6)
+    assert not torch.allclose(mean, new, atol=1e-4)  # so that the two can be told apart
+    assert torch.equal(scored[-1], weights_of(trainer.average))
+    saved = load_weights(tmp_path / "run/weights.safetensors")
+    assert torch.allclose(weights_of(saved), weights_of(trainer.average), atol=2e-3)
+
+
+def test_without_an_average_the_last_weights_are_saved(tmp_path, clips):
+    trainer = Trainer(tmp_path / "run", recipe(average=0), clips)
+    assert trainer.run(progress=False) and trainer.average is trainer.tracker
+    saved = load_weights(tmp_path / "run/weights.safetensors")
+    assert torch.allclose(weights_of(saved), weights_of(trainer.tracker), atol=2e-3)
+
+
+def weights_of(tracker):
+    return torch.cat([p.detach().flatten() for p in tracker.parameters()])
+
+
 def test_interrupt_saves_between_two_steps(tmp_path, clips):
     with start(tmp_path, clips) as process:
         wait_for(process, 2)
@@ -72,7 +101,7 @@ def test_a_loss_that_is_not_finite_stops_with_its_batch(tmp_path, clips):
 
 def test_training_overfits_one_clip(tmp_path, clips):
     whole = {"sampling": SamplingConfig(tracks=24, seen=0.0, anywhere=0.0, backward=0.0), "frames": (8, 8)}
-    world = {"motion": MotionConfig(world=1.0, turned=0.0)}  # so every step sees the same example
+    world = {"motion": MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0), "sensor": 0.0}  # so every step sees the same example
     config = recipe(matching_steps=0, steps=150, lr=2e-3, save_every=1000, head=1e-3, **whole, **world)
     trainer = Trainer(tmp_path, config, clips[:1])
     assert trainer.run(progress=False)

@@ -115,9 +115,8 @@ def cpu_setting(minutes: float) -> Setting:
         frames=8,  # one window
         iterations=2,
         lr=1.5e-3,
-        motion=MotionConfig(
-            world=1.0, turned=0.0
-        ),  # no camera coordinates: all of the time goes into one kind of motion
+        motion=MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0),  # all of the time goes into one kind of
+        sensor=0.0,  # motion and into perfect depth
         sampling=SamplingConfig(tracks=48),
         minutes=minutes,
         matching_steps=80,  # shares of the time, as all that follows
@@ -138,7 +137,8 @@ def gpu_setting(minutes: float, device: str = "cuda") -> Setting:
         iterations=3,  # one number: each pair of frames and updates is recorded anew, and keeps a step's memory
         train_encoder=True,
         lr=1e-3,
-        motion=MotionConfig(world=1.0, turned=0.0),
+        motion=MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0),
+        sensor=0.0,
         sampling=SamplingConfig(tracks=64),
         minutes=minutes,
         matching_steps=80,

@@ -39,6 +39,8 @@ class TrainConfig:
         train_encoder: train the encoder too; otherwise its features are stored in files, and a step costs half.
         lr, weight_decay, warmup, clip_norm: of AdamW with one cosine cycle (paper: 5e-4, 5e-4, 0.05, 10).
         precision: `"float32"`, or `"bfloat16"` for autocast.
+        average: the weights that are scored and saved are an exponential average over so many steps, or over a tenth of
+            the steps done where that is less; 0: the last weights.
         head: standard deviation of the output layer's initial weights.
         seed: of the random generators.
         evaluate_every: steps between evaluations on held-out clips.
@@ -69,6 +71,7 @@ class TrainConfig:
     warmup: float = 0.05
     clip_norm: float = 10.0
     precision: str = "float32"
+    average: int = 1000
     head: float = 0.01
     seed: int = 0
     evaluate_every: int = 1000
@@ -89,8 +92,8 @@ class TrainConfig:
             if len(getattr(self, name)) != 2 or not 1 <= getattr(self, name)[0] <= getattr(self, name)[1]:
                 raise ValueError(f"TrainConfig.{name}: expected (fewest, most), both at least 1, got {value}")
         check_range(self, 1, math.inf, "clips", "steps", "batch", "evaluate_every", "save_every")
-        check_range(self, 0, math.inf, "matching_steps", "validation")
-        check_range(self, 0, 1, "short")
+        check_range(self, 0, math.inf, "matching_steps", "validation", "average")
+        check_range(self, 0, 1, "short", "sensor")
         if self.minutes is not None and self.minutes <= 0:
             raise ValueError(f"TrainConfig.minutes: expected a positive time or None, got {self.minutes}")
         if self.precision not in ("float32", "bfloat16"):
@@ -124,6 +127,7 @@ class TrainConfig:
             "augment": True,
             "lr": 5e-4,
             "precision": "bfloat16",
+            "average": 0,
             "evaluate_every": 5000,
             "save_every": 1000,
             "loss": LossConfig(form="paper", visibility=3.0),

@@ -7,6 +7,7 @@ the work: each step uses the mean of their gradients.
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -40,6 +41,7 @@ class Trainer:
 
     Attributes:
         tracker: what is trained.
+        average: the mean of its last weights, which is scored and saved.
         examples: its input, by step.
         step: number of steps done, of both stages together.
         schedule: how far the training has come.
@@ -98,6 +100,9 @@ class Trainer:
             self.step, self.seconds = saved["step"], saved["seconds"]
         self.schedule = Schedule(config, self.group, 0 if saved is None else saved["position"])
         self.group.copy_from_main(self.tracker.parameters())
+        self.average = copy.deepcopy(self.tracker).requires_grad_(False) if config.average else self.tracker
+        if config.average and saved is not None:
+            self.average.load_state_dict(saved.get("average", saved["model"]))  # older checkpoints have none
         if compiled:
             _compile(self.tracker)
         self._enter_stage(saved)
@@ -126,10 +131,10 @@ class Trainer:
             due = halted or self.schedule.finished or self.step % self.config.save_every == 0
             if due and self.group.is_main:
                 state = {"model": self.tracker.state_dict(), "optimizer": self.optimizer.state_dict()}
-                state |= {"step": self.step, "position": self.schedule.position, "seconds": self.seconds}
+                state |= {"average": self.average.state_dict(), "step": self.step, "position": self.schedule.position, "seconds": self.seconds}
                 self.folder.save(state)
         if self.schedule.finished and self.group.is_main:
-            save_weights(self.tracker, self.folder.path / "weights.safetensors", half=True)
+            save_weights(self.average, self.folder.path / "weights.safetensors", half=True)
 
     def example(self) -> list[FramePair] | Batch:
         """The input of the next step."""
@@ -152,6 +157,7 @@ class Trainer:
             group |= {"lr": lr, "betas": (beta1, group["betas"][1])}
         self.optimizer.step()
         self.step += 1
+        self._add_to_average()
         self.seconds += time.perf_counter() - started
         line |= {"norm": norm, "lr": lr, "seconds": self.seconds}
         self.schedule.advance(self.step)
@@ -162,6 +168,14 @@ class Trainer:
         if self.group.is_main:
             self.folder.write(line)
         return line
+
+    @torch.no_grad()
+    def _add_to_average(self) -> None:
+        """The average forgets what is older than a tenth of the steps done, or than `config.average` steps."""
+        if self.average is not self.tracker:
+            share = max(1 / self.config.average, 10 / (self.step + 9))  # 1 in the first step
+            for mean, new in zip(self.average.parameters(), self.tracker.parameters(), strict=True):
+                mean.lerp_(new, share)
 
     def _match(self, pairs: list[FramePair]) -> dict:
         self._drawn = {"rgb": [pair.rgb for pair in pairs], "uv": [pair.uv for pair in pairs]}
@@ -206,9 +220,9 @@ class Trainer:
             self.optimizer.load_state_dict(saved["optimizer"])
 
     def _scores(self) -> dict[str, float]:
-        self.tracker.eval()
+        self.average.eval()
         with torch.compiler.set_stance("force_eager"):  # held-out clips have other shapes than parts are compiled for
-            scores = self.validate(self.tracker)
+            scores = self.validate(self.average)
         self.tracker.train()
         return scores
 
