@@ -17,7 +17,7 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 import tapip3d_lite as t3d
-from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, run_benchmark, summary_table
+from tapip3d_lite.evaluation.benchmark import ALL, METRICS, SPLITS, run_benchmark, summary_table
 from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
 from tapip3d_lite.files import write_text
 from tapip3d_lite.lab.card import model_card
@@ -36,12 +36,15 @@ def track(
     grid: Annotated[int, arg(help="queries on the first frame, side x side, where the clip has none")] = 16,
     own_queries: Annotated[bool, arg(help="use the clip's own queries where it has some")] = True,
     space: Annotated[str, arg(help="world or camera (learnt trackers)")] = "world",
+    size: Annotated[tuple[int, int] | None, arg(help="height and width to look at (learnt trackers)")] = None,
+    crop: Annotated[tuple[int, int, int, int] | None, arg(help="left, top, right, bottom to look at, in pixels")] = None,
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
 ) -> None:
     """Track the points of a clip (npz) in 3D."""
     loaded = t3d.load_clip(clip)
     queries = loaded.queries if own_queries and loaded.queries is not None else t3d.grid_queries(loaded, grid)
-    result = t3d.load_tracker(tracker, device=device).track(loaded, queries=queries, space=space)
+    options = {"queries": queries, "space": space, "size": size, "crop": crop}
+    result = t3d.load_tracker(tracker, device=device).track(loaded, **options)
     shown = result.visible.mean() if result.visible.size else 0.0
     print(f"{clip}: {len(queries)} points over {len(loaded)} frames with {tracker}, {shown:.0%} visible")
     if loaded.tracks is not None and own_queries:
@@ -77,7 +80,7 @@ def evaluate(
 
 def benchmark(
     tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("lite", "static", "klt"),
-    split: Annotated[tuple[str, ...], arg(help="static-camera, moving-camera, occlusion; default: all")] = (),
+    split: Annotated[tuple[str, ...], arg(help="by default the first three; the others are hard: " + ", ".join(ALL))] = SPLITS,
     space: Annotated[tuple[str, ...], arg(help="world, camera or both (learnt trackers)")] = ("world",),
     count: Annotated[int | None, arg(help="only the first clips of each split")] = None,
     out: Annotated[Path | None, arg(help="JSON with every clip's scores; an interrupted run is continued")] = None,
@@ -85,14 +88,13 @@ def benchmark(
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
 ) -> None:
     """Score trackers on the Lite benchmark; prints Markdown tables with 95 % bootstrap intervals over clips."""
-    splits = split or SPLITS
-    results = run_benchmark(tracker_runs(tracker, space, device), splits, count, out)
+    results = run_benchmark(tracker_runs(tracker, space, device), split, count, out)
     for part in ("", "_dynamic", "_static"):
-        print(summary_table(results, tuple(metric + part for metric in METRICS), splits) + "\n")
+        print(summary_table(results, tuple(metric + part for metric in METRICS), split) + "\n")
     if figure:
         from tapip3d_lite.figures.curves import score_figure
 
-        t3d.figures.save_png(score_figure(results, splits=splits), figure)
+        t3d.figures.save_png(score_figure(results, splits=split), figure)
         print(f"wrote {figure}")
 
 

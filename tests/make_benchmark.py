@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from tapip3d_lite.evaluation.lite_splits import COUNT, HARD, SPLITS, fingerprint, flawed, split_file
+from tapip3d_lite.evaluation.lite_splits import ALL, COUNT, fingerprint, flawed, split_file
 from tapip3d_lite.simulate import SimulationConfig, render_clip, simulate_rollout
 from tapip3d_lite.simulate.rollout import save_rollouts
 from tapip3d_lite.simulate.seeds import BENCHMARK
@@ -31,7 +31,7 @@ def split_config(split: str, index: int) -> SimulationConfig:
 
 def split_seed(split: str, index: int) -> int:
     """The seed of a split's clip: the splits take successive seeds from a thousand each."""
-    return BENCHMARK.start + 1000 * (*SPLITS, *HARD).index(split) + index
+    return BENCHMARK.start + 1000 * ALL.index(split) + index
 
 
 def write_split(split: str) -> None:
@@ -42,5 +42,5 @@ def write_split(split: str) -> None:
 
 
 if __name__ == "__main__":
-    for split in sys.argv[1:] or (*SPLITS, *HARD):
+    for split in sys.argv[1:] or ALL:
         write_split(split)

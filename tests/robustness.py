@@ -1,60 +1,207 @@
-"""python robust.py weights out.json [clips]: robustness of a tracker."""
-import sys, json, numpy as np, cv2, time
+"""What happens to a tracker outside the benchmark's clean clips: `python -m tests.robustness --tracker lite static klt`.
+
+A picture that slides at a constant speed; wrong poses, poor depth, soft and grey images, frozen depth and other image
+sizes on clips of `moving-camera`, each against the same clips as they are, paired; the share of hidden frames called
+visible. Results go to a JSON file, which an interrupted run continues, a Markdown page (for `card --also`) and a figure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
 import tapip3d_lite as t3d
-from tapip3d_lite.evaluation.lite_splits import benchmark_clips
-from tapip3d_lite.simulate.degrade import SensorConfig, degrade
-from tapip3d_lite.training.motion import move
-from tapip3d_lite.geometry import invert
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.evaluation.benchmark import show
+from tapip3d_lite.evaluation.evaluate import markdown_table
+from tapip3d_lite.evaluation.intervals import bootstrap_interval, paired_difference
+from tapip3d_lite.evaluation.lite_splits import benchmark_clips
+from tapip3d_lite.files import write_text
+from tapip3d_lite.geometry import unproject
+from tapip3d_lite.simulate.degrade import SensorConfig, degrade, wrong_poses
 
-def jitter(clip, deg, seed):
-    rng=np.random.default_rng(seed); T=len(clip)
-    ax=rng.normal(size=(T,3)); ax/=np.linalg.norm(ax,axis=-1,keepdims=True)
-    E=np.repeat(np.eye(4)[None],T,0)
-    for t in range(T): E[t,:3,:3]=cv2.Rodrigues(ax[t]*np.radians(deg)*rng.normal())[0]
-    e=clip.extrinsics.astype(float)
-    return move(clip, invert(E@e)@e)
+SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)  # pixels a frame, of 128
+SIZES = ((96, 96), (128, 128), (192, 192), (256, 256))
+DISTANCE, FOCAL, SIDE = 5.0, 128.0, 128
+METRICS = ("AJ3D_none", "APD3D_none", "AJ3D_none_dynamic", "APD3D_none_dynamic", "OA")
 
-def photo(speed, frames=32, seed=0):
-    rng=np.random.default_rng(seed); S=128
-    big=np.zeros((512,512,3),np.float32)
-    for k in (4,8,16,32,64,128):
-        big+=cv2.resize(rng.random((k,k,3),np.float32),(512,512),interpolation=cv2.INTER_CUBIC)*(1/ k**0.35)
-    big=(255*(big-big.min())/(big.max()-big.min()))
-    ang=rng.uniform(0,2*np.pi); d=np.array([np.cos(ang),np.sin(ang)])
-    K=np.array([[128,0,63.5],[0,128,63.5],[0,0,1]],np.float32); z=5.0
-    vid=[];
+
+def sensor(**strengths: float) -> Callable[[Clip, int], Clip]:
+    return lambda clip, seed: degrade(clip, SensorConfig(**strengths), seed)
+
+
+def grey(clip: Clip, _seed: int) -> Clip:
+    images = [cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) for image in clip.video]
+    return replace(clip, video=np.stack(images))
+
+
+def frozen_depth(clip: Clip, _seed: int) -> Clip:
+    """The first frame's depth in all frames, as a sensor that hangs gives it."""
+    return replace(clip, depths=np.repeat(clip.depths[:1], len(clip), 0))
+
+
+CONDITIONS: dict[str, Callable[[Clip, int], Clip]] = {
+    "as it is": lambda clip, _seed: clip,
+    "poses wrong by 0.5°": lambda clip, seed: wrong_poses(clip, 0.5, seed, drift=0),
+    "poses wrong by 1°": lambda clip, seed: wrong_poses(clip, 1.0, seed, drift=0),
+    "poses wrong by 2°": lambda clip, seed: wrong_poses(clip, 2.0, seed, drift=0),
+    "depth scale flickers by 2 %": sensor(flicker=0.02),
+    "depth noise of 1 %": sensor(noise=0.01),
+    "depth noise of 5 %": sensor(noise=0.05),
+    "half of the depth missing": sensor(dropout=0.5),
+    "images blurred by 2 px": sensor(blur=2.0),
+    "grey images": grey,
+    "frozen depth": frozen_depth,
+}
+
+
+def sliding_picture(speed: float, seed: int, frames: int) -> tuple[Clip, np.ndarray]:
+    """A random picture on a wall that slides at `speed` pixels a frame; the clip with 36 queries, and its step (2,) in metres."""
+    rng = np.random.default_rng(seed)
+    wall = sum(
+        cv2.resize(rng.random((k, k, 3), np.float32), (512, 512), interpolation=cv2.INTER_CUBIC) * k**-0.35
+        for k in (4, 8, 16, 32, 64, 128)
+    )
+    wall = 255 * (wall - wall.min()) / (wall.max() - wall.min())
+    angle = rng.uniform(0, 2 * np.pi)
+    step = speed * np.array([np.cos(angle), np.sin(angle)])
+    video = []
     for t in range(frames):
-        s=d*speed*t
-        M=np.float32([[1,0,192-s[0]],[0,1,192-s[1]]])
-        vid.append(cv2.warpAffine(big,M,(S,S),flags=cv2.INTER_LINEAR|cv2.WARP_INVERSE_MAP).round().clip(0,255).astype(np.uint8))
-    uv=np.stack(np.meshgrid(np.linspace(32,96,6),np.linspace(32,96,6)),-1).reshape(-1,2)
-    def lift(p): return np.concatenate([(p-63.5)/128*z, np.full((len(p),1),z)],-1)
-    q=np.concatenate([np.zeros((36,1)),lift(uv)],-1).astype(np.float32)
-    clip=Clip(np.stack(vid),np.full((frames,S,S),z,np.float32),np.repeat(K[None],frames,0),np.repeat(np.eye(4,dtype=np.float32)[None],frames,0),queries=q)
-    return clip,d*z/128
+        shift = np.float32([[1, 0, 192 - t * step[0]], [0, 1, 192 - t * step[1]]])
+        image = cv2.warpAffine(wall, shift, (SIDE, SIDE), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        video.append(image.round().clip(0, 255).astype(np.uint8))
+    k = np.array([[FOCAL, 0, (SIDE - 1) / 2], [0, FOCAL, (SIDE - 1) / 2], [0, 0, 1]], np.float32)
+    side = np.linspace(32, 96, 6)
+    uv = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    places = unproject(uv, np.full(len(uv), DISTANCE), k)
+    queries = np.concatenate([np.zeros((len(uv), 1)), places], -1).astype(np.float32)
+    depths = np.full((frames, SIDE, SIDE), DISTANCE, np.float32)
+    cameras = np.repeat(k[None], frames, 0), np.repeat(np.eye(4, dtype=np.float32)[None], frames, 0)
+    return Clip(np.stack(video), depths, *cameras, queries=queries), step * DISTANCE / FOCAL
 
-def slide(tr):
-    out={}
-    for v in (0.1,0.25,0.5,1,2,4):
-        r7,r31=[],[]
-        for seed in range(3):
-            n=32 if v<=1 else 12
-            clip,d=photo(v,n,seed); tk=tr.track(clip)
-            mv=(tk.xyz[:,:,:2]-tk.xyz[0,:,:2])@(d/np.linalg.norm(d))/np.linalg.norm(d)  # px
-            r7.append(np.median(mv[7])/(7*v)); r31.append(np.median(mv[n-1])/((n-1)*v))
-        out[v]=(float(np.mean(r7)),float(np.mean(r31)))
-    return out
 
-if __name__=='__main__':
-    tr=t3d.load_tracker(sys.argv[1]); n=int(sys.argv[3]) if len(sys.argv)>3 else 8
-    res={'slide':slide(tr)}; print(res['slide'],flush=True)
-    clips=benchmark_clips('moving-camera',n,progress=False)
-    conds={'clean':lambda c,i:c,'pose0.5':lambda c,i:jitter(c,.5,i),'pose1':lambda c,i:jitter(c,1,i),'pose2':lambda c,i:jitter(c,2,i),
-     'flicker2%':lambda c,i:degrade(c,SensorConfig(flicker=.02),i),'noise1%':lambda c,i:degrade(c,SensorConfig(noise=.01),i),'noise5%':lambda c,i:degrade(c,SensorConfig(noise=.05),i),
-     'holes50%':lambda c,i:degrade(c,SensorConfig(dropout=.5),i),'blur2':lambda c,i:degrade(c,SensorConfig(blur=2),i)}
-    for k,f in conds.items():
-        sc=[t3d.evaluate(tr.track(f(c,i)),f(c,i)) for i,c in enumerate(clips)]
-        res[k]={m:float(np.nanmean([s[m] for s in sc])) for m in ('AJ3D_none','APD3D_none','APD3D_none_dynamic','APD3D_none_static','OA')}
-        print(k,{a:round(b,3) for a,b in res[k].items()},flush=True)
-    json.dump(res,open(sys.argv[2],'w'))
+def followed(tracker: object, speed: float, seeds: int = 3) -> dict[str, float]:
+    """The median share of the motion that points have made after 7 frames, and after 31 where the picture stays in view."""
+    frames = 32 if speed <= 1 else 8
+    shares = []
+    for seed in range(seeds):
+        clip, step = sliding_picture(speed, seed, frames)
+        moved = tracker.track(clip).xyz - clip.queries[:, 1:]
+        shares.append(np.median(moved[..., :2] @ step / (step @ step), axis=1))  # (T,) in frames of motion
+    mean = np.mean(shares, 0)
+    return {str(t): float(mean[t] / t) for t in (7, 31) if t < frames}
+
+
+def falsely_visible(pred: t3d.Tracks, clip: Clip) -> dict[str, float]:
+    """The share of truly hidden frames from the query on that are called visible, of all points and of moving ones."""
+    hidden = ~clip.tracks.visible & (np.arange(len(clip))[:, None] >= clip.queries[:, 0])
+    moving = hidden & clip.tracks.dynamic
+    return {
+        name: float(pred.visible[mask].mean()) if mask.any() else math.nan
+        for name, mask in (("hidden_visible", hidden), ("hidden_visible_dynamic", moving))
+    }
+
+
+def scored(tracker: object, clip: Clip, **options: object) -> dict[str, float]:
+    start = time.process_time()
+    pred = tracker.track(clip, **options)
+    seconds = time.process_time() - start
+    scores = t3d.evaluate(pred, clip)
+    return {name: scores[name] for name in METRICS} | falsely_visible(pred, clip) | {"seconds": seconds}
+
+
+def measure(names: list[str], count: int, out: Path) -> dict:
+    """Fill in what `out` lacks: `results[tracker][measurement]`, of one clip each for the conditions and sizes."""
+    results = json.loads(out.read_text()) if out.exists() else {}
+    clips = benchmark_clips("moving-camera", count)
+    jobs: dict[str, Callable] = {f"slide {speed:g}": partial(followed, speed=speed) for speed in SPEEDS}
+    for index, clip in enumerate(clips):
+        for name, change in CONDITIONS.items():
+            jobs[f"{name} {index}"] = lambda t, c=clip, f=change, i=index: scored(t, f(c, i))
+        for size in SIZES:
+            jobs[f"size {size[0]} {index}"] = lambda t, c=clip, s=size: scored(t, c, size=s)
+    for name in names:
+        tracker, mine = t3d.load_tracker(name), results.setdefault(name, {})
+        todo = [job for job in jobs if job not in mine and (hasattr(tracker, "config") or not job.startswith("size"))]
+        for job in tqdm(todo, desc=name):
+            mine[job] = jobs[job](tracker)
+            write_text(out, json.dumps(results, indent=1) + "\n")
+    return results
+
+
+def page(results: dict, count: int) -> str:
+    """The Markdown page."""
+
+    def scores(name: str, what: str, metric: str) -> list[float]:
+        found = [results[name].get(f"{what} {index}", {}).get(metric) for index in range(count)]
+        return [math.nan if x is None else x for x in found]
+
+    names, frames = list(results), ("7", "31")
+    rows = [
+        [f"{s:g}", *(f"{results[n][f'slide {s:g}'][t]:.2f}" if t in results[n][f"slide {s:g}"] else "" for n in names for t in frames)]
+        for s in SPEEDS
+    ]  # fmt: skip
+    head = ["pixels a frame", *(f"{name}, after {t} frames" for name in names for t in frames)]
+    parts = ["Share of a sliding picture's motion that points follow (median of 36 points, mean of three pictures):"]
+    parts += [markdown_table(head, rows)]
+    parts += [f"The first {count} clips of `moving-camera`, changed; paired differences to the same clips as they are:"]
+    rows = []
+    for name in names:
+        for what in CONDITIONS:
+            own = [show(bootstrap_interval(scores(name, what, m))) for m in METRICS[:2]]
+            pairs = [[scores(name, x, m) for x in (what, "as it is")] for m in METRICS[:2]]
+            rows.append([name, what, *own, *(show(paired_difference(*pair), "+") for pair in pairs)])
+    parts += [markdown_table(["tracker", "condition", *METRICS[:2], "AJ3D_none lost", "APD3D_none lost"], rows)]
+    parts += ["Truly hidden frames, from the query on, that are called visible:"]
+    shares = ("hidden_visible", "hidden_visible_dynamic")
+    rows = [[n, *(show(bootstrap_interval(scores(n, "as it is", m))) for m in shares)] for n in names]
+    parts += [markdown_table(["tracker", "all points", "moving points"], rows)]
+    learnt = [name for name in names if f"size {SIZES[0][0]} 0" in results[name]]
+    parts += ["The same clips (128x128) resized; processor seconds a clip, side by side in one run:"]
+    rows = [
+        [n, f"{s[0]}", *(show(bootstrap_interval(scores(n, f"size {s[0]}", m))) for m in METRICS[:2]), f"{np.mean(scores(n, f'size {s[0]}', 'seconds')):.1f}"]
+        for n in learnt for s in SIZES
+    ]  # fmt: skip
+    parts += [markdown_table(["tracker", "size", *METRICS[:2], "seconds"], rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def figure(results: dict) -> Figure:
+    """Share of the motion followed after 7 frames over the speed."""
+    fig = Figure(figsize=(6, 3.6), layout="constrained")
+    ax = fig.add_subplot()
+    for name, color in zip(results, matplotlib.color_sequences["tab10"], strict=False):
+        ax.plot(SPEEDS, [results[name][f"slide {s:g}"]["7"] for s in SPEEDS], "o-", color=color, label=name)
+    ax.set(xscale="log", xlabel="the picture slides by … pixels a frame", ylabel="share followed after 7 frames")
+    ax.set_xticks(SPEEDS, [f"{s:g}" for s in SPEEDS])
+    ax.axhline(1, color="0.6", linewidth=0.8)
+    ax.legend(frameon=False)
+    return fig
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tracker", nargs="+", default=["lite", "static", "klt"], help="names or weights files")
+    parser.add_argument("--clips", type=int, default=16, help="of moving-camera")
+    parser.add_argument("--out", type=Path, default=Path("robustness.json"), help="also .md and .png beside it")
+    options = parser.parse_args()
+    results = measure(options.tracker, options.clips, options.out)
+    write_text(options.out.with_suffix(".md"), page(results, options.clips))
+    t3d.figures.save_png(figure(results), options.out.with_suffix(".png"))
+    print(page(results, options.clips))
+
+
+if __name__ == "__main__":
+    main()

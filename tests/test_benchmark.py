@@ -15,8 +15,19 @@ from tapip3d_lite.evaluation import benchmark, lite_splits
 from tapip3d_lite.evaluation.baselines import Baseline, KltTracker, StaticTracker
 from tapip3d_lite.evaluation.benchmark import difference_table, load_results, run_benchmark, save_results, summary_table
 from tapip3d_lite.evaluation.intervals import bootstrap_interval, paired_difference
-from tapip3d_lite.evaluation.lite_splits import FOLDER, SPLITS, benchmark_clips, differences, fingerprint
+from tapip3d_lite.evaluation.lite_splits import (
+    ALL,
+    DRIFT,
+    FOLDER,
+    HARD,
+    SPLITS,
+    benchmark_clips,
+    differences,
+    fingerprint,
+    split_file,
+)
 from tapip3d_lite.figures.curves import score_figure
+from tapip3d_lite.geometry import project
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.simulate import render_clip, seeds, simulate_clip, simulate_rollout, simulator
@@ -109,22 +120,50 @@ def test_seeds_are_kept_apart(monkeypatch, tmp_path):
 
 
 def test_stored_splits_are_what_they_claim_and_small():
-    stored = {split: load_rollouts(FOLDER / f"{split}.npz") for split in SPLITS}
+    stored = {split: load_rollouts(split_file(split)) for split in ALL}
     used = [rollout.seed for part in stored.values() for rollout, _ in part]
-    assert len(set(used)) == 48 and set(used) <= set(seeds.BENCHMARK)
-    assert sum(path.stat().st_size for path in FOLDER.iterdir()) < 1.5e6
+    assert len(set(used)) == 16 * 7 and set(used) <= set(seeds.BENCHMARK)
+    assert max(path.stat().st_size for path in FOLDER.rglob("*.npz")) < 5e5
     for split, part in stored.items():
         first = [split_seed(split, 0) + index for index in range(16)]
         assert [rollout.seed for rollout, _ in part] == first  # blindly the first ones, none left out
         for index, (rollout, _) in enumerate(part):
             config = rollout.config
             assert config == split_config(split, index)
-            assert (config.frames, config.fps, config.size, config.tracks) == (24, 12.0, (128, 128), 256)
+            assert (config.frames, config.tracks) == (24, 256)
+            assert config.size == ((160, 96) if split == "portrait" else (128, 128))
+            assert config.fps >= 100 if split == "slow" else config.fps == 12
             assert rollout.states.dtype == np.float64 and rollout.states.shape[:2] == (24, 1)
             moves = np.abs(np.diff(rollout.extrinsics, axis=0)).max()
             assert (moves > 0) == (config.camera != "static")
     assert {r.config.camera for r, _ in stored["moving-camera"]} == {"linear", "arc", "handheld"}
     assert all(r.config.occluder for r, _ in stored["occlusion"])
+
+
+def test_hard_clips_are_hard():
+    """What each split is there for, in numbers."""
+    creeping = benchmark_clips("slow", 3, progress=False)
+    for clip in creeping:
+        uv, _ = project(clip.tracks.xyz, clip.intrinsics[:1], clip.extrinsics[:1])  # as the first camera would see it
+        speed = np.linalg.norm(np.diff(uv, axis=0), axis=-1).mean(0)[clip.tracks.dynamic]
+        assert np.median(speed) < 1.0 and (speed > 0.05).mean() > 0.5
+    for index, clip in enumerate(benchmark_clips("drift", 4, progress=False)):
+        still = clip.tracks.xyz[:, ~clip.tracks.dynamic]
+        turned = np.linalg.norm(np.diff(still, axis=0), axis=-1).mean() / np.linalg.norm(still, axis=-1).mean()
+        assert 0.2 < np.degrees(turned) / DRIFT[index] < 3  # what rests is said to move
+    for clip in benchmark_clips("sensor", 3, progress=False):
+        uv, z = project(clip.tracks.xyz, clip.intrinsics, clip.extrinsics)
+        seen = clip.tracks.visible
+        u, v = np.rint(uv[seen]).astype(int).clip(0, 127).T
+        found = clip.depths[np.nonzero(seen)[0], v, u]
+        assert (found == 0).mean() > 0.01 or np.median(np.abs(found - z[seen]) / z[seen]) > 2e-3
+
+
+@pytest.mark.parametrize("split", HARD)
+def test_a_hard_clip_films_as_stored(split, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (clip,) = benchmark_clips(split, 1, progress=False)
+    assert clip.name == f"{split}-00" and not differences(clip, load_rollouts(split_file(split))[0][1])
 
 
 def test_occlusions_occur():

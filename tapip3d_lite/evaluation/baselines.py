@@ -33,6 +33,8 @@ class Baseline:
         bidirectional: bool = True,
         depth_roi: str | tuple[float, float] | None = None,
         visible_threshold: float | None = None,
+        size: tuple[int, int] | None = None,
+        crop: tuple[int, int, int, int] | None = None,
         progress: bool = False,
     ) -> Tracks:
         """Tracks of `queries` (N, 4), or of the clip's own queries, or of a grid.

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from tapip3d_lite.evaluation.baselines import TrackerLike
 from tapip3d_lite.evaluation.evaluate import evaluate, markdown_table
 from tapip3d_lite.evaluation.intervals import Estimate, bootstrap_interval, paired_difference
-from tapip3d_lite.evaluation.lite_splits import COUNT, FOLDER, SPLITS, benchmark_clips, check_split
+from tapip3d_lite.evaluation.lite_splits import ALL, COUNT, SPLITS, benchmark_clips, check_split, split_file
 from tapip3d_lite.files import write_text
 
 Results = dict[str, dict[str, dict[str, dict[str, float]]]]  # label → split → clip → metric → score
@@ -34,7 +34,7 @@ def run_benchmark(
 
     Args:
         runs: (label, tracker, options of its `track`), e.g. `("mine", tracker, {"space": "camera"})`.
-        splits: some of `SPLITS`.
+        splits: some of `lite_splits.ALL`.
         count: only the first so many clips of each split.
         out: JSON file, saved after every clip. Clips that it holds are not tracked again, unless the weights (or a
             baseline's settings) or the benchmark have changed since.
@@ -70,8 +70,8 @@ def run_benchmark(
 def version_of(tracker: object, options: Mapping[str, object]) -> str:
     """A short digest of everything that scores depend on: the benchmark's clips, a tracker's settings, weights, options."""
     digest = hashlib.sha256()
-    for split in SPLITS:
-        digest.update((FOLDER / f"{split}.npz").read_bytes())
+    for split in ALL:
+        digest.update(split_file(split).read_bytes())
     digest.update(f"{getattr(tracker, 'config', tracker)!r} {sorted(options.items())}".encode())
     if hasattr(tracker, "state_dict"):
         for name, weights in tracker.state_dict().items():
@@ -110,7 +110,7 @@ def estimate(results: Results, label: str, split: str, metric: str) -> Estimate:
     return bootstrap_interval([clips[name].get(metric, math.nan) for name in sorted(clips)])
 
 
-def summary_table(results: Results, metrics: Sequence[str] = METRICS, splits: Sequence[str] = SPLITS) -> str:
+def summary_table(results: Results, metrics: Sequence[str] = METRICS, splits: Sequence[str] = ALL) -> str:
     """A Markdown table: one row a split (clips) and tracker, means with 95 % bootstrap intervals over clips."""
     rows = [
         [f"{split} ({len(scores[split])})", label, *(show(estimate(results, label, split, m)) for m in metrics)]
@@ -122,7 +122,7 @@ def summary_table(results: Results, metrics: Sequence[str] = METRICS, splits: Se
 
 
 def difference_table(
-    results: Results, ours: str, theirs: str, metrics: Sequence[str] = METRICS, splits: Sequence[str] = SPLITS
+    results: Results, ours: str, theirs: str, metrics: Sequence[str] = METRICS, splits: Sequence[str] = ALL
 ) -> str:
     """A Markdown table of ours - theirs, paired by clip, with 95 % intervals; one row a split."""
     one, other = results.get(ours, {}), results.get(theirs, {})

@@ -1,4 +1,7 @@
-"""The clips of the Lite benchmark: three splits and four hard ones, stored as rollouts, rendered on first use and compared with fingerprints.
+"""The clips of the Lite benchmark: stored as rollouts, rendered on first use and compared with fingerprints.
+
+Beside the three splits of the benchmark stand four hard ones: bodies that creep (`slow`), wrong poses (`drift`), a poor
+depth sensor (`sensor`), and tall images (`portrait`).
 
 The files in `lite_benchmark/` hold the results of the physics, so that every machine scores the same clips; each clip's
 fingerprint reveals a change of the renderer that would silently change the scores.
@@ -25,15 +28,16 @@ FOLDER = Path(__file__).parent / "lite_benchmark"
 SPLITS = ("static-camera", "moving-camera", "occlusion")
 HARD = ("slow", "drift", "sensor", "portrait")
 DRIFT = (0.25, 0.5, 1.0, 2.0)  # degrees of pose error, clip by clip
+ALL = (*SPLITS, *HARD)
 COUNT = 16
 Job = tuple[Path, str, Rollout, dict[str, np.ndarray]]  # file in the cache, name, what to render, fingerprint
 SLACK = {"tracks": 2, "depths": 4, "visible": 0, "video": 4}  # millimetres, millimetres, bits, grey levels
 
 
 def check_split(split: str) -> None:
-    """Raise ValueError for a split that is none of `SPLITS` and `HARD`."""
-    if split not in (*SPLITS, *HARD):
-        raise ValueError(f"split: expected one of {', '.join((*SPLITS, *HARD))}, got {split!r}; choose one of them")
+    """Raise ValueError for a split that is none of `ALL`."""
+    if split not in ALL:
+        raise ValueError(f"split: expected one of {', '.join(ALL)}, got {split!r}; choose one of them")
 
 
 def split_file(split: str) -> Path:

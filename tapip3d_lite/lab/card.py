@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tapip3d_lite.evaluation.benchmark import METRICS, SPLITS, difference_table, load_results, summary_table
+from tapip3d_lite.evaluation.benchmark import ALL, METRICS, difference_table, load_results, summary_table
 from tapip3d_lite.model.weights import load_weights
 from tapip3d_lite.training.augment import augmentations
 from tapip3d_lite.training.recipe import TrainConfig
@@ -42,7 +42,7 @@ def model_card(
         raise ValueError(
             f"card: expected steps in {folder / 'log.jsonl'} and scores in {results}; one of them is empty"
         )
-    compared = [label for label in scores if any(split in scores[label] for split in SPLITS)]
+    compared = [label for label in scores if any(split in scores[label] for split in ALL)]
     trackers = " ".join(dict.fromkeys(label.rpartition(" · ")[0] or label for label in compared))  # not once a space
     scoring = f"python -m tapip3d_lite benchmark --tracker {trackers} --space world camera --out {Path(results).name}"
     parts = [

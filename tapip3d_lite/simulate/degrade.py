@@ -107,21 +107,24 @@ def degrade(clip: Clip, config: SensorConfig, seed: int | np.random.Generator = 
     return replace(clip, depths=depths, video=video)
 
 
-def wrong_poses(clip: Clip, degrees: float, seed: int | np.random.Generator = 0) -> Clip:
+def wrong_poses(clip: Clip, degrees: float, seed: int | np.random.Generator = 0, drift: float = 0.1) -> Clip:
     """The clip with `pose_error` in its cameras. What each camera sees stays; where that is in the world moves with it."""
     extrinsics = clip.extrinsics.astype(np.float64)
-    error = pose_error(np.random.default_rng(seed), len(clip), degrees)
+    error = pose_error(np.random.default_rng(seed), len(clip), degrees, drift)
     return move(clip, invert(error @ extrinsics) @ extrinsics)
 
 
-def pose_error(rng: np.random.Generator, frames: int, degrees: float) -> np.ndarray:
-    """Rigid errors (T, 4, 4) of cameras: in each frame one angle N(0, sigma) about a random axis (as the paper's), and drift."""
-    drift = np.cumsum(0.1 * np.radians(degrees) * rng.normal(size=(frames, 6)), 0)
+def pose_error(rng: np.random.Generator, frames: int, degrees: float, drift: float = 0.1) -> np.ndarray:
+    """Rigid errors (T, 4, 4) of cameras: in each frame an angle N(0, sigma) about a random axis (as the paper's).
+
+    In addition the cameras drift: about and along each axis by N(0, drift sigma) a frame, in radians and metres.
+    """
+    wander = np.cumsum(drift * np.radians(degrees) * rng.normal(size=(frames, 6)), 0)
     axes = rng.normal(size=(frames, 3))
     turns = axes / np.linalg.norm(axes, axis=-1, keepdims=True) * np.radians(degrees) * rng.normal(size=(frames, 1))
     error = np.repeat(np.eye(4)[None], frames, 0)
-    error[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in turns + drift[:, :3]]
-    error[:, :3, 3] = drift[:, 3:]
+    error[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in turns + wander[:, :3]]
+    error[:, :3, 3] = wander[:, 3:]
     return error
 
 
