@@ -10,11 +10,11 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
+from lessons.backward_ways import saving_backward
 from lessons.formulas import Formula, Symbol, find_function, formula_table, formulas, main
 from tapip3d_lite.geometry import transform
 from tapip3d_lite.model.frames import Frames, frames_from_clip
 from tapip3d_lite.recorder import Recorder
-from tapip3d_lite.training.backward import saving_backward
 from tapip3d_lite.training.loss import LossConfig, Truth
 
 TABLE = Path(__file__).resolve().parents[1] / "notebooks" / "FORMULAS.md"
