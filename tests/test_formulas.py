@@ -137,7 +137,7 @@ def test_what_the_code_does_not_have_is_refused():
     formula = Formula("", "x", "x", "geometry.transform", "return points @", (Symbol("x", "pixels", "()"),))
     with pytest.raises(ValueError, match="nothing is called 'pixels'"):
         formula.line_of(formula.symbols[0])
-    for marker, count in (("nonsense", 0), ("pose", 4)):
+    for marker, count in (("nonsense", 0), ("pose", 2)):
         with pytest.raises(ValueError, match=f"found {count}"):
             replace(formula, marker=marker).line()
     for path in ("geometry.nothing", "nothing.transform", "geometry.Array"):

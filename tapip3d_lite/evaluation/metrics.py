@@ -67,12 +67,7 @@ def tapvid3d_metrics(
 
 
 def tapvid2d_metrics(
-    gt_uv: Array,
-    gt_visible: Array,
-    uv: Array,
-    visible: Array,
-    queries: Array,
-    mode: str = "first",
+    gt_uv: Array, gt_visible: Array, uv: Array, visible: Array, queries: Array, mode: str = "first"
 ) -> dict[str, float]:
     """TAP-Vid metrics of one video.
 

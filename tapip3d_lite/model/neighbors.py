@@ -118,16 +118,10 @@ def _nearest(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) 
 
 
 def nearest_first(distance: Tensor, indices: Tensor, count: int, masked: bool) -> Tensor:
-    """The indices with the smallest distances, lowest index first among equals.
+    """The indices (F, N, K), of (P,) or (F, N, P) int64, with the smallest distances (F, N, P), nearest first.
 
-    Args:
-        distance: (F, N, P), not negative; infinite where a point may not be chosen.
-        indices: (P,) or (F, N, P) int64.
-        count: K.
-        masked: fill the slots of points that may not be chosen, see `knn`.
-
-    Returns:
-        (F, N, K) int64, nearest first.
+    Among equals the lowest index comes first. Distances are not negative, and infinite where a point may not be chosen;
+    with `masked` the slots of such points are filled, see `knn`.
     """
     # The bits of a non-negative float order like the float itself, so one integer holds (distance, index).
     key = (distance.view(torch.int32).long() << 32) + indices

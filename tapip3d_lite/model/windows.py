@@ -183,34 +183,25 @@ class State:
 def query_support(
     neighborhood: Callable[..., Neighbors], scene: Scene, times: Tensor, coords: Tensor
 ) -> list[Neighbors]:
-    """Neighbourhoods of queries, each in the frame where it was asked.
+    """Neighbourhoods of queries, each in the frame where it was asked: for each level (B, N, 1 + K, ...).
 
-    Args:
-        neighborhood: as `neighbors.KNearest.forward`.
-        scene: T frames.
-        times: (B, N) int64 query frames.
-        coords: (B, N, 3) queries in the scene's space.
-
-    Returns:
-        For each level (B, N, 1 + K, ...), see `around_queries`.
+    The query frames `times` (B, N) are int64, `coords` (B, N, 3) the queries in the scene's space.
     """
     supports = []
     for level in scene.levels:
         whole: dict[str, Tensor] = {}
         for frame in times.unique().tolist():
             columns = (times == frame).any(0).nonzero()[:, 0]  # (n,) asked here in any batch element
-            mine = (times[:, columns] == frame)[..., None, None]  # (B, n, 1, 1)
-            near = around_queries(
-                neighborhood, scene.cut(frame, frame + 1), level.cut(frame, frame + 1), coords[:, columns]
-            )
+            mine = times[:, columns] == frame  # (B, n)
+            here = scene.cut(frame, frame + 1), level.cut(frame, frame + 1)
+            near = around_queries(neighborhood, *here, coords[:, columns])
             for name in ("features", "points", "indices"):
-                new = getattr(near, name)
-                if new is not None:
-                    new = new[:, 0].unsqueeze(-1) if name == "indices" else new[:, 0]  # (B, n, 1 + K, ...)
+                if getattr(near, name) is not None:
+                    new = getattr(near, name)[:, 0]  # (B, n, 1 + K, ...)
                     total = whole.setdefault(name, new.new_zeros(*times.shape, *new.shape[2:]))
-                    total[:, columns] = torch.where(mine, new, total[:, columns])
-        indices = whole["indices"].squeeze(-1) if "indices" in whole else None
-        supports.append(Neighbors(whole["features"], whole["points"], coords, indices))
+                    fits = mine.view(*mine.shape, *[1] * (new.ndim - 2))  # (B, n, 1, ...)
+                    total[:, columns] = torch.where(fits, new, total[:, columns])
+        supports.append(Neighbors(**whole, center=coords))
     return supports
 
 

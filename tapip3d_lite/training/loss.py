@@ -93,9 +93,8 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
     entropy = F.binary_cross_entropy_with_logits(step.logits, visible.to(step.logits.dtype), reduction="none")
     weight = config.scale * config.discount ** (iterations - 1 - step.iteration)
     # A mean over each clip, then over clips: so the mean over processes is the mean over all their clips.
-    position, visibility = (
-        ((x * counted).flatten(1).sum(1) / counted.flatten(1).sum(1).clamp(min=1)).mean() for x in (error, entropy)
-    )
+    total = counted.flatten(1).sum(1).clamp(min=1)
+    position, visibility = (((x * counted).flatten(1).sum(1) / total).mean() for x in (error, entropy))
     return weight * position, weight * config.visibility * visibility
 
 
