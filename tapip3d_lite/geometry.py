@@ -106,13 +106,10 @@ def pixel_grid(height: int, width: int, like: Array) -> Array:
 def resize_intrinsics(
     intrinsics: Array, old_size: tuple[int, int], new_size: tuple[int, int], corners: bool = False
 ) -> Array:
-    """Intrinsics of a resized image: u' = (u + 1/2) W' / W - 1/2, v' likewise, because images begin at -1/2.
+    """Intrinsics (..., 3, 3) of an image resized from (H, W) to (H', W').
 
-    Args:
-        intrinsics: (..., 3, 3).
-        old_size: (H, W) that the intrinsics belong to.
-        new_size: (H', W').
-        corners: u' = u (W' - 1) / (W - 1) instead: corner centres stay corner centres, as in the released code.
+    u' = (u + 1/2) W' / W - 1/2, v' likewise, because images begin at -1/2; with `corners` u' = u (W' - 1) / (W - 1):
+    corner centres stay corner centres, as in the released code.
 
     Raises:
         ValueError: a size without pixels, or for `corners` below 2.

@@ -107,9 +107,7 @@ class Normalizer:
         weight = valid.flatten(1).unsqueeze(-1)  # (B, P, 1)
         count = weight.sum(1, keepdim=True)
         if check and not bool((count > 0).all()):
-            raise ValueError(
-                "depths: a window has no valid point inside depth_roi, so coordinates have no scale; widen depth_roi"
-            )
+            raise ValueError("depths: a window has no valid point in depth_roi, so there is no scale; widen depth_roi")
         flat = points.flatten(1, 3)  # (B, P, 3)
         mean = torch.where(weight, flat, 0).sum(1, keepdim=True) / count
         square = torch.where(weight, flat - mean, 0).square()

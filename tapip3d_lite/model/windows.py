@@ -130,15 +130,12 @@ class State:
     @classmethod
     def start(cls, queries: Tensor, frames: Frames, space: Any, multiple: int, check: bool = True) -> State:
         """Trajectories that stand still at their queries (B, N, 4), given in the world; `check` their frames or not."""
-        if queries.ndim != 3 or queries.shape[0] != len(frames.depths) or queries.shape[2] != 4:
-            raise ValueError(
-                f"queries: expected ({len(frames.depths)}, N, 4) rows (t, x, y, z), got {tuple(queries.shape)}"
-            )
+        clips = len(frames.depths)
+        if queries.ndim != 3 or queries.shape[0] != clips or queries.shape[2] != 4:
+            raise ValueError(f"queries: expected ({clips}, N, 4) rows (t, x, y, z), got {tuple(queries.shape)}")
         times = queries[..., 0].long()
         if check and bool(((times < 0) | (times >= len(frames))).any()):
-            raise ValueError(
-                f"queries: t must be in [0, {len(frames) - 1}], got {int(times.min())}..{int(times.max())}"
-            )
+            raise ValueError(f"queries: t must be in [0, {len(frames) - 1}], got {times.min()}..{times.max()}")
         batch = torch.arange(len(queries), device=queries.device)[:, None]  # (B, 1)
         with torch.autocast(queries.device.type, enabled=False):
             cameras = frames.intrinsics[batch, times], frames.extrinsics[batch, times]  # (B, N, ...)

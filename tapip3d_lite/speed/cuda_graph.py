@@ -39,19 +39,17 @@ class CudaGraphStep:
     """A step that adds gradients, recorded for each number of frames and updates that it meets.
 
     Each recording keeps a step's memory for itself, so a recipe of many lengths needs as many times as much.
+
+    Args:
+        step: from a batch and M to tensors; leaves gradients. A batch is anything with `frames` and `map(function of a
+            tensor)`.
+        tracker: which it trains; `sync_free` while it is recorded.
+        parameters: that get gradients.
     """
 
     def __init__(
         self, step: Callable[[Any, int], tuple[Tensor, ...]], tracker: nn.Module, parameters: Sequence[nn.Parameter]
     ) -> None:
-        """Prepare to record.
-
-        Args:
-            step: from a batch and M to tensors; leaves gradients. A batch is anything with `frames` and `map(function of a
-                tensor)`.
-            tracker: which it trains; `sync_free` while it is recorded.
-            parameters: that get gradients.
-        """
         self._step, self._tracker, self._parameters, self._recorded = step, tracker, list(parameters), {}
 
     def __call__(self, batch: Any, iterations: int) -> tuple[Tensor, ...]:

@@ -70,17 +70,10 @@ class LossConfig:
 
 
 def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> tuple[Tensor, Tensor]:
-    """Position and visibility terms of one update, weighted and discounted.
+    """Position and visibility terms of one of M updates, weighted and discounted: two scalars whose sum is minimised.
 
-    Args:
-        step: from `Tracker.steps`.
-        truth: of all frames and tracks of the same batch.
-        iterations: M.
-        config: weights.
-
-    Returns:
-        Two scalars whose sum is minimised. Frames before the query, padded frames (repetitions of the last one) and
-        inactive tracks, which only fill up the batch, do not count.
+    `truth` has all frames and tracks of the batch. Frames before the query, padded frames (repetitions of the last one)
+    and inactive tracks, which only fill up the batch, do not count.
     """
     target, visible, counted, depth, focal = _compared(step, truth)
     depth = depth.clamp(min=0.1)
