@@ -10,9 +10,9 @@ from tapip3d_lite.validate import floats
 
 
 def queries_from_pixels(clip: Clip, pixels: np.ndarray) -> np.ndarray:
-    """Lift pixel queries, rows (t, u, v), to world-space queries, float32 rows (t, x, y, z), by the nearest pixel's depth.
+    """Lift pixel queries, rows (t, u, v), to world-space queries, float32 rows (t, x, y, z).
 
-    (0, 0) is the top-left pixel's centre.
+    The depth is that of the nearest pixel; (0, 0) is the top-left pixel's centre.
 
     Raises:
         ValueError: wrong shape, frame or pixel outside the clip, or invalid depth there.

@@ -36,10 +36,8 @@ def tapvid3d_metrics(
     """TAPVid-3D metrics of one video.
 
     Args:
-        gt_xyz: (T, N, 3) true points, camera frame of each t, scene units.
-        gt_visible: (T, N) bool.
-        xyz: (T, N, 3) predicted points, camera frame of each t.
-        visible: (T, N) bool.
+        gt_xyz, xyz: (T, N, 3) true and predicted points, camera frame of each t, scene units.
+        gt_visible, visible: (T, N) bool.
         intrinsics: (T, 3, 3) or (3, 3), used as given (the benchmark scales them by 256 / min(H, W) first).
         queries: (N, 4) rows (t, ...) or (N,) query frames; needed by `per_trajectory` and `median_on_queries`.
         scaling: how the prediction's scale is matched to the truth before scoring, one of `SCALINGS`.
@@ -72,10 +70,8 @@ def tapvid2d_metrics(
     """TAP-Vid metrics of one video.
 
     Args:
-        gt_uv: (T, N, 2) true pixels on a 256 x 256 raster.
-        gt_visible: (T, N) bool.
-        uv: (T, N, 2) predicted pixels on the same raster.
-        visible: (T, N) bool.
+        gt_uv, uv: (T, N, 2) true and predicted pixels on a 256 x 256 raster.
+        gt_visible, visible: (T, N) bool.
         queries: (N, 3 or 4) rows (t, ...) or (N,) query frames.
         mode: `"first"` scores frames after the query, `"strided"` all but the query frame.
 

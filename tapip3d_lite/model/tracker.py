@@ -34,8 +34,6 @@ from tapip3d_lite.model.windows import Scene, State, Step, Window, query_support
 _CHUNK = 2**25  # floats of context tokens that exist at once without gradient: 128 MiB
 _CPU_CHUNK = 2**21  # on a CPU 8 MiB are twice as fast, since temporaries stay in the cache
 
-__all__ = ["Tracker", "TrackerConfig"]
-
 
 class Tracker(nn.Module):
     """Tracks any points of a posed RGB-D video in 3D.

@@ -75,8 +75,8 @@ class Transformer(nn.Module):
     def forward(self, tokens: Tensor, active: Tensor | None = None) -> Tensor:
         """Corrections (B, S, N, at least 4) from trajectory tokens (B, S, N, inputs).
 
-        They are dx, dy, dz (normalised coordinates) and the change of the visibility logit. Of `active` (B, N) tracks
-        the others, which do not exist, are seen by nobody; None: all exist.
+        They are dx, dy, dz (normalised coordinates) and the change of the visibility logit. `active` (B, N) bool says
+        which tracks exist, None: all; the others are seen by nobody.
         """
         points = self.input(tokens)  # (B, S, N, inputs) -> (B, S, N, U)
         batch, frames, count = points.shape[:3]

@@ -21,6 +21,8 @@ from tapip3d_lite.model.cloud import Level, Normalizer
 from tapip3d_lite.model.frames import Frames
 from tapip3d_lite.model.neighbors import Neighbors, bilinear
 
+Neighborhood = Callable[..., Neighbors]  # as `KNearest.forward`
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -177,9 +179,7 @@ class State:
         self.logits[:, start:stop, columns] = torch.where(mask, logits, old[1])
 
 
-def query_support(
-    neighborhood: Callable[..., Neighbors], scene: Scene, times: Tensor, coords: Tensor
-) -> list[Neighbors]:
+def query_support(neighborhood: Neighborhood, scene: Scene, times: Tensor, coords: Tensor) -> list[Neighbors]:
     """Neighbourhoods of queries, each in the frame where it was asked: for each level (B, N, 1 + K, ...).
 
     The query frames `times` (B, N) are int64, `coords` (B, N, 3) the queries in the scene's space.
@@ -202,7 +202,7 @@ def query_support(
     return supports
 
 
-def around_queries(neighborhood: Callable[..., Neighbors], scene: Scene, level: Level, coords: Tensor) -> Neighbors:
+def around_queries(neighborhood: Neighborhood, scene: Scene, level: Level, coords: Tensor) -> Neighbors:
     """Neighbourhoods (B, T, N, 1 + K, ...) of queries (B, N, 3) in each of T frames, the query itself first.
 
     That first row has the bilinear feature at the query's pixel and index -1.

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.model.neighbors import Neighbors
-from tapip3d_lite.model.windows import Scene, around_queries
+from tapip3d_lite.model.windows import Neighborhood, Scene, around_queries
 
 _WARM = 2  # runs before recording: they compile, and choose algorithms
 
@@ -94,9 +94,7 @@ def _tensors(batch: Any) -> list[Tensor]:
     return tensors
 
 
-def support_at_once(
-    neighborhood: Callable[..., Neighbors], scene: Scene, times: Tensor, coords: Tensor
-) -> list[Neighbors]:
+def support_at_once(neighborhood: Neighborhood, scene: Scene, times: Tensor, coords: Tensor) -> list[Neighbors]:
     """As `model.windows.query_support`: all queries in all frames, of which each query's own frame is kept.
 
     That is T times the work, but T times fewer calls, and nothing depends on values.
