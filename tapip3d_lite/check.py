@@ -57,14 +57,10 @@ class Finding:
 
 
 def check_clip(clip: Clip) -> list[Finding]:
-    """Findings for a clip, most basic first; an empty list where nothing is suspicious.
+    """Findings for a clip, whose true tracks are not used, most basic first; none where nothing is suspicious.
 
-    Args:
-        clip: any clip; ground truth is not used.
-
-    Returns:
-        One `Finding` for each mistake in the simplest set of fixes that makes the clip consistent. Applying them in
-        the order given repairs the clip.
+    There is one for each mistake in the simplest set of fixes that makes the clip consistent. Applying them in their
+    order repairs the clip.
     """
     findings, repaired = [], clip
     for test in (_wrong_intrinsics, _ray_length):
@@ -94,9 +90,7 @@ def _wrong_intrinsics(clip: Clip) -> list[Finding]:
             return []
         size = np.rint(2 * point + 1).astype(int)
         message = f"intrinsics look made for a {size[0]}x{size[1]} image, the video is {width}x{height}"
-        remedy = (
-            f"Multiply row 0 by {ratio[0]:.4g} and row 1 by {ratio[1]:.4g}, or exactly: geometry.resize_intrinsics."
-        )
+        remedy = f"Multiply row 0 by {ratio[0]:.4g}, row 1 by {ratio[1]:.4g}, or exactly: geometry.resize_intrinsics."
     else:
         return []
     after = float(np.abs(np.median(fix(clip).intrinsics[:, :2, 2], axis=0) / centre - 1).max())

@@ -20,20 +20,7 @@ from typing import Any
 import torch
 
 _HARMLESS = {
-    "builtins": {
-        "bool",
-        "bytes",
-        "complex",
-        "dict",
-        "float",
-        "frozenset",
-        "int",
-        "list",
-        "set",
-        "slice",
-        "str",
-        "tuple",
-    },
+    "builtins": {x.__name__ for x in (bool, bytes, complex, dict, float, frozenset, int, list, set, slice, str, tuple)},
     "collections": {"OrderedDict", "defaultdict"},
     "torch": {"Size", "device", *(str(x)[6:] for x in vars(torch).values() if isinstance(x, torch.dtype))},
     "torch._utils": {"_rebuild_tensor", "_rebuild_tensor_v2", "_rebuild_parameter"},
@@ -43,18 +30,8 @@ _HARMLESS = {
     "_codecs": {"encode"},  # how numpy writes bytes at protocol 2
 }
 # What these packages define is data to us: recorded, never called.
-_RECORDED = {
-    "omegaconf",
-    "box",
-    "typing",
-    "pathlib",
-    "argparse",
-    "addict",
-    "easydict",
-    "munch",
-    "yacs",
-    "ml_collections",
-}
+_RECORDED = {"omegaconf", "box", "typing", "pathlib", "argparse"}
+_RECORDED |= {"addict", "easydict", "munch", "yacs", "ml_collections"}
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
@@ -76,9 +53,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, torch.T
         raise ValueError(f"{path}: the configuration refers to itself; the file is damaged") from None
     weight = content["weight"]
     if not isinstance(weight, Mapping) or not all(isinstance(value, torch.Tensor) for value in weight.values()):
-        raise ValueError(
-            f'{path}: expected "weight" to hold named tensors, got {type(weight).__name__} of other things'
-        )
+        raise ValueError(f'{path}: expected named tensors in "weight", got {type(weight).__name__} of other things')
     return cfg, dict(weight)
 
 
@@ -142,9 +117,7 @@ def _read_pickle(path: str | Path) -> Any:
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             if any(name.endswith("constants.pkl") for name in archive.namelist()):
-                raise ValueError(
-                    f"{path}: a TorchScript program, which could run code; expected a plain torch.save file"
-                )
+                raise ValueError(f"{path}: a TorchScript program, which could run code; expected a torch.save file")
     elif tarfile.is_tarfile(path):
         raise ValueError(f"{path}: a tar archive of torch before 0.2; load and save it with a newer torch first")
     try:

@@ -163,9 +163,7 @@ class Clip:
         arrays = dict(self.extras) | {key: getattr(self, key) for key in _CLIP_KEYS} | {"query_point": self.queries}
         if self.tracks is not None:
             if not np.array_equal(self.tracks.queries, self.queries):
-                raise ValueError(
-                    "Clip.save: tracks.queries differ from clip.queries; one file holds one set of queries"
-                )
+                raise ValueError("Clip.save: tracks.queries differ from clip.queries; a file holds one set of queries")
             arrays |= {"tracks": self.tracks.xyz, "visible": self.tracks.visible, "dynamic": self.tracks.dynamic}
         arrays |= {"name": np.array(self.name), "fps": np.array(self.fps)}
         save_npz(path, arrays)
@@ -217,20 +215,15 @@ def load_tracks(path: str | Path) -> Tracks:
 
 
 def check_queries(clip: Clip, queries: np.ndarray) -> np.ndarray:
-    """Check world-space queries against a clip and return them as float32.
-
-    Args:
-        queries: (N, 4) rows (t, x, y, z).
+    """Check world-space queries (N, 4), rows (t, x, y, z), against a clip and return them as float32.
 
     Raises:
         ValueError: wrong shape, t not a frame of the clip, or a point outside that frame's view.
     """
     queries = floats("queries", queries, (None, 4), finite=True)
     t = query_frames(clip, queries)
-    camera = clip.intrinsics[t], clip.extrinsics[t]
-    uv, z = project(queries[:, None, 1:], *camera)
+    uv, z = (x[:, 0] for x in project(queries[:, None, 1:], clip.intrinsics[t], clip.extrinsics[t]))
     height, width = clip.size
-    uv, z = uv[:, 0], z[:, 0]
     # Half a pixel is the image's border; the rest is slack for float32 and for points on a border pixel.
     outside = (z <= 0) | (np.abs(uv * 2 - (width - 1, height - 1)) > (width + 2, height + 2)).any(-1)
     if outside.any():

@@ -21,27 +21,12 @@ THRESHOLDS = (1, 2, 4, 8, 16)  # errors in these pixels below which a point coun
 
 
 def transform(points: Array, pose: Array) -> Array:
-    """Apply a rigid (or affine) motion to points.
-
-    Args:
-        points: (..., N, 3).
-        pose: (..., 4, 4), acting on column vectors: x' = R x + t.
-
-    Returns:
-        (..., N, 3) in the target frame of `pose`.
-    """
+    """Points (..., N, 3) moved by a rigid (or affine) motion (..., 4, 4) of column vectors: x' = R x + t."""
     return points @ pose[..., :3, :3].swapaxes(-1, -2) + pose[..., None, :3, 3]
 
 
 def invert(pose: Array) -> Array:
-    """Invert a rigid motion: (R, t) becomes (R^T, -R^T t).
-
-    Args:
-        pose: (..., 4, 4) with an orthonormal rotation part.
-
-    Returns:
-        (..., 4, 4).
-    """
+    """Invert a rigid motion (..., 4, 4): (R, t) becomes (R^T, -R^T t)."""
     xp = _library(pose)
     rotation = pose[..., :3, :3].swapaxes(-1, -2)
     translation = -(rotation @ pose[..., :3, 3:])
@@ -97,15 +82,9 @@ def in_image(points: Array, intrinsics: Array, extrinsics: Array, size: tuple[in
 
 
 def point_map(depths: Array, intrinsics: Array, extrinsics: Array | None = None) -> Array:
-    """Lift whole depth maps to organised point maps.
+    """Lift whole depth maps (..., H, W) to organised point maps (..., H, W, 3), by cameras as in `unproject`.
 
-    Args:
-        depths: (..., H, W) z-depth; 0 puts the pixel at the camera's centre, as the released model does.
-        intrinsics: (..., 3, 3).
-        extrinsics: (..., 4, 4) world to camera, or None for points in the camera frame.
-
-    Returns:
-        (..., H, W, 3).
+    A depth of 0 puts the pixel at the camera's centre, as the released model does.
     """
     height, width = depths.shape[-2:]
     flat = depths.reshape(*depths.shape[:-2], height * width)
@@ -127,13 +106,10 @@ def pixel_grid(height: int, width: int, like: Array) -> Array:
 def resize_intrinsics(
     intrinsics: Array, old_size: tuple[int, int], new_size: tuple[int, int], corners: bool = False
 ) -> Array:
-    """Intrinsics of a resized image: u' = (u + 1/2) W' / W - 1/2, v' likewise, because images begin at -1/2.
+    """Intrinsics (..., 3, 3) of an image resized from (H, W) to (H', W').
 
-    Args:
-        intrinsics: (..., 3, 3).
-        old_size: (H, W) that the intrinsics belong to.
-        new_size: (H', W').
-        corners: u' = u (W' - 1) / (W - 1) instead: corner centres stay corner centres, as in the released code.
+    u' = (u + 1/2) W' / W - 1/2, v' likewise, because images begin at -1/2; with `corners` u' = u (W' - 1) / (W - 1):
+    corner centres stay corner centres, as in the released code.
 
     Raises:
         ValueError: a size without pixels, or for `corners` below 2.

@@ -64,14 +64,9 @@ _IGNORED |= {"encoder.pretrained", "encoder.freeze_mode"}
 
 
 def load_official(path: str | Path, fast: bool = True) -> Tracker:
-    """Read the authors' checkpoint file {"cfg", "weight", …}; no code from the file can run.
+    """Read the authors' checkpoint file (.pth) {"cfg", "weight", …}; no code from the file can run.
 
-    Args:
-        path: the .pth file, saved from a CPU or a GPU.
-        fast: use the fast forms of its parts, see `Tracker`.
-
-    Returns:
-        The tracker on the CPU, in evaluation mode.
+    Returns the tracker on the CPU, in evaluation mode, with the `fast` forms of its parts or the clear ones.
 
     Raises:
         ValueError: not such a file, a refused global in its pickle, or a model that we do not know.
@@ -88,8 +83,7 @@ def from_official_state(cfg: Mapping[str, Any], state: Mapping[str, Tensor], fas
         state: parameters under the authors' names.
         fast: use the fast forms of its parts, see `Tracker`.
 
-    Returns:
-        The tracker in evaluation mode; its space is `"world"`, and `"camera"` serves as well.
+    Returns the tracker in evaluation mode; its space is `"world"`, and `"camera"` serves as well.
 
     Raises:
         ValueError: options or parameters that are unknown, missing or of another shape, by name.

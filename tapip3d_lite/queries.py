@@ -10,13 +10,9 @@ from tapip3d_lite.validate import floats
 
 
 def queries_from_pixels(clip: Clip, pixels: np.ndarray) -> np.ndarray:
-    """Lift pixel queries (t, u, v) to world-space queries by the depth at the nearest pixel.
+    """Lift pixel queries, rows (t, u, v), to world-space queries, float32 rows (t, x, y, z).
 
-    Args:
-        pixels: (N, 3) rows (t, u, v); (0, 0) is the top-left pixel's centre.
-
-    Returns:
-        (N, 4) float32 rows (t, x, y, z).
+    The depth is that of the nearest pixel; (0, 0) is the top-left pixel's centre.
 
     Raises:
         ValueError: wrong shape, frame or pixel outside the clip, or invalid depth there.
@@ -45,14 +41,10 @@ def grid_queries(clip: Clip, side: int = 16, frame: int = 0, margin: float = 1 /
     """A side x side grid of queries on one frame, without the nodes that fall on invalid depth.
 
     The outermost nodes keep `margin` times the image width from every border, as in the released code's support grid.
-
-    Returns:
-        (at most side^2, 4) float32 rows (t, x, y, z), row-major.
+    Rows (t, x, y, z) are float32, in row-major order.
     """
     if side < 1 or not 0 <= frame < len(clip):
-        raise ValueError(
-            f"grid_queries: expected side >= 1 and a frame in [0, {len(clip) - 1}], got side={side}, frame={frame}"
-        )
+        raise ValueError(f"grid_queries: expected side >= 1, a frame in [0, {len(clip) - 1}], got {side=}, {frame=}")
     height, width = clip.size
     inset = width * margin
     u, v = np.meshgrid(np.linspace(inset, width - inset, side), np.linspace(inset, height - inset, side))

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
+from lessons.backward_ways import plain_backward, saving_backward
 from lessons.saved_bytes import SavedBytes
 from tapip3d_lite.model.frames import frames_from_clip
-from tapip3d_lite.training.backward import plain_backward, saving_backward
 from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
 from tests.tiny import SIZES
 

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from lessons.backward_ways import plain_backward, saving_backward
 from lessons.checker import check
 from lessons.milestone import milestone
 from lessons.n06_augmentations import TITLES, augmented, before_and_after, motion_paths
@@ -77,10 +78,12 @@ __all__ = [
     "motion_paths",
     "parts",
     "pipeline",
+    "plain_backward",
     "progress",
     "ratio",
     "reset",
     "reveal",
+    "saving_backward",
     "setting",
     "show",
     "small_scene",

@@ -36,10 +36,8 @@ def tapvid3d_metrics(
     """TAPVid-3D metrics of one video.
 
     Args:
-        gt_xyz: (T, N, 3) true points, camera frame of each t, scene units.
-        gt_visible: (T, N) bool.
-        xyz: (T, N, 3) predicted points, camera frame of each t.
-        visible: (T, N) bool.
+        gt_xyz, xyz: (T, N, 3) true and predicted points, camera frame of each t, scene units.
+        gt_visible, visible: (T, N) bool.
         intrinsics: (T, 3, 3) or (3, 3), used as given (the benchmark scales them by 256 / min(H, W) first).
         queries: (N, 4) rows (t, ...) or (N,) query frames; needed by `per_trajectory` and `median_on_queries`.
         scaling: how the prediction's scale is matched to the truth before scoring, one of `SCALINGS`.
@@ -56,7 +54,7 @@ def tapvid3d_metrics(
         raise ValueError(f"intrinsics: expected ({len(p)}, 3, 3) or (3, 3), got {focal.shape}")
     if not (focal[..., [0, 1], [0, 1]] > 0).all():
         raise ValueError(
-            "intrinsics: expected positive fx and fy in pixels; give K as [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+            "intrinsics: expected positive fx and fy (pixels) in K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
         )
     scale = scale_factor(p, q, v & w, _query_frames(queries, p.shape[:2]), scaling)
     pixel = p[..., 2] / np.sqrt(focal[..., 0, 0] * focal[..., 1, 1])[..., None]
@@ -67,20 +65,13 @@ def tapvid3d_metrics(
 
 
 def tapvid2d_metrics(
-    gt_uv: Array,
-    gt_visible: Array,
-    uv: Array,
-    visible: Array,
-    queries: Array,
-    mode: str = "first",
+    gt_uv: Array, gt_visible: Array, uv: Array, visible: Array, queries: Array, mode: str = "first"
 ) -> dict[str, float]:
     """TAP-Vid metrics of one video.
 
     Args:
-        gt_uv: (T, N, 2) true pixels on a 256 x 256 raster.
-        gt_visible: (T, N) bool.
-        uv: (T, N, 2) predicted pixels on the same raster.
-        visible: (T, N) bool.
+        gt_uv, uv: (T, N, 2) true and predicted pixels on a 256 x 256 raster.
+        gt_visible, visible: (T, N) bool.
         queries: (N, 3 or 4) rows (t, ...) or (N,) query frames.
         mode: `"first"` scores frames after the query, `"strided"` all but the query frame.
 

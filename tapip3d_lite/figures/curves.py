@@ -101,11 +101,8 @@ def _dot(color: str, filled: bool) -> dict[str, Any]:
 
 def _row(axes: Sequence[Axes], lines: Sequence[Line], zero_motion: Mapping[str, float], by: str, window: int) -> None:
     matching, tracking = ([line for line in lines if line["stage"] == name] for name in ("matching", "tracking"))
-    titles = (
-        "the encoder learns to match",
-        "the tracker learns to track",
-        "bold: examples · dots: held out · dashed: zero motion",
-    )
+    titles = ["the encoder learns to match", "the tracker learns to track"]
+    titles += ["bold: examples · dots: held out · dashed: zero motion"]
     for ax, title, label in zip(axes, titles, ("right within 1.5 cells", "loss", "APD3D"), strict=True):
         label_axes(ax, label, by)
         ax.set_title(title, fontsize=8, color=INK)

@@ -45,13 +45,8 @@ def frame_with_tracks(
 ) -> Figure:
     """A video frame with the tracked points: filled where visible, hollow where occluded, tails over past frames.
 
-    Args:
-        clip: the clip.
-        tracks: what to draw, world frame.
-        frame: frame index.
-        tail: how many past frames the tails cover.
-        truth: true tracks of the same queries; a white line then joins each estimate with the truth.
-        ax: axes to draw into, else a new figure.
+    With the true tracks of the same queries, `truth`, a white line joins each estimate with its place. Without `ax` the
+    figure is a new one.
     """
     check_drawable(clip, tracks, frame)
     ax = ax or _axes(clip)

@@ -32,8 +32,7 @@ def tracks_3d(
     reader turns it while the slider moves.
 
     Args:
-        clip: the clip.
-        tracks: what to draw, world frame.
+        clip, tracks: what to draw.
         points: cloud points per frame (the page grows by about 19 bytes a point and frame).
         max_tracks: at most this many tracks are drawn, evenly picked.
         tail: past frames that the tails cover.
@@ -46,12 +45,9 @@ def tracks_3d(
     # A frame carries only what changes; the rest stays with the traces and the colour axes of the layout.
     frames = [go.Frame(name=str(t), data=[go.Scatter3d(part) for part in now]) for t, now in enumerate(parts)]
     traces = [go.Scatter3d(part).update(style) for part, style in zip(parts[0], _styles(colors), strict=True)]
+    text = f"{title or clip.name} · world axes, scene units<br><sup>{_key(tail)}</sup>"
     layout = {
-        "title": {
-            "text": f"{title or clip.name} · world axes, scene units<br><sup>{_key(tail)}</sup>",
-            "font": {"size": 14},
-            "x": 0.02,
-        },
+        "title": {"text": text, "font": {"size": 14}, "x": 0.02},
         "scene": _scene(_View.of(clip, clouds, tracks), limits),
         "coloraxis": _color_axis(_CLOUD_COLORS),
         "coloraxis2": _color_axis(colors),
@@ -64,13 +60,9 @@ def tracks_3d(
 
 
 def tracks_3d_static(clip: Clip, tracks: Tracks, frames: Sequence[int] | None = None, points: int = 4000) -> Figure:
-    """The matplotlib twin of `tracks_3d`: its opening view at a few instants.
+    """The matplotlib twin of `tracks_3d`: its opening view in some frames, by default the first, middle and last.
 
-    Args:
-        clip: the clip.
-        tracks: what to draw, world frame.
-        frames: frame indices; default first, middle and last.
-        points: cloud points per panel.
+    Each panel has that many `points` of the cloud.
     """
     frames = [0, len(clip) // 2, len(clip) - 1] if frames is None else list(frames)
     for t in frames:
@@ -168,9 +160,8 @@ def _draw_tripod(ax: Axes, view: _View) -> None:
         ax.annotate("", corner + end, corner, arrowprops=arrow)
         far = end * (1 + 0.07 * _SIGHT / max(np.linalg.norm(end), 0.02))
         ax.text(*(corner + far), name, fontsize=8, color=INK, ha="center", va="center")
-    ax.set_title(
-        f"{ax.get_title()}  (arrows: world axes, {length:g} scene unit{'' if length == 1 else 's'})", fontsize=9
-    )
+    units = "scene unit" if length == 1 else "scene units"
+    ax.set_title(f"{ax.get_title()}  (arrows: world axes, {length:g} {units})", fontsize=9)
 
 
 def _foreground(clip: Clip, tracks: Tracks, most: int) -> tuple[Clip, Tracks]:

@@ -25,16 +25,11 @@ FACTOR = 1 + 2 * len(DEGREES)  # outputs per input: 33
 
 
 def fourier(x: Tensor) -> Tensor:
-    """[x | sin(2^j x) | cos(2^j x)] for j = -2..13, degree by degree: distances from a quarter unit down to 2^-13.
+    """[x | sin(2^j x) | cos(2^j x)] for j = -2..13, degree by degree: (..., d) to (..., 33 d).
 
-    The cosine is taken as sin(2^j x + pi/2) in float32, as the released model does: the rounding of that sum reaches
-    1e-3 at the highest degree, so another formula would not reproduce its numbers.
-
-    Args:
-        x: (..., d) float32 or float64.
-
-    Returns:
-        (..., 33 d).
+    It tells distances from a quarter unit down to 2^-13. The cosine is taken as sin(2^j x + pi/2) in float32, as the
+    released model does: the rounding of that sum reaches 1e-3 at the highest degree, so another formula would not
+    reproduce its numbers.
     """
     scales = constant(_SCALES, x)
     angles = (x.unsqueeze(-2) * scales[:, None]).flatten(-2)  # (..., 16, d) -> (..., 16 d)
@@ -42,13 +37,7 @@ def fourier(x: Tensor) -> Tensor:
 
 
 class OffsetEmbedding(nn.Sequential):
-    """MLP on the Fourier features of a 3D offset: LayerNorm, (Linear, GELU) x layers, LayerNorm.
-
-    Args:
-        layers: number of linear layers.
-        hidden: their width.
-        width: D, channels of the result.
-    """
+    """MLP on the Fourier features of a 3D offset: LayerNorm, (Linear, GELU) x layers, LayerNorm; D = `width`."""
 
     def __init__(self, layers: int, hidden: int, width: int) -> None:
         widths = [3 * FACTOR, *[hidden] * (layers - 1), width]
@@ -72,15 +61,9 @@ class Attention(nn.Module):
         self.to_out = nn.Linear(inner, width)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Let x attend to context.
+        """Let x (..., Q, D) attend to context (..., M, D), whose leading dimensions broadcast against those of x.
 
-        Args:
-            x: (..., Q, D).
-            context: (..., M, D); leading dimensions broadcast against those of x.
-            mask: (..., M) bool, False for tokens that must not be seen, or None.
-
-        Returns:
-            (..., Q, D).
+        The bool mask (..., M) is False for tokens that must not be seen. Returns (..., Q, D).
         """
         q, k, v = self._heads(x, context)  # (..., heads, Q or M, head_dim)
         lead = torch.broadcast_shapes(q.shape[:-2], k.shape[:-2])
@@ -136,8 +119,7 @@ class Pool(nn.Module):
 def time_embedding(frames: int, width: int) -> Tensor:
     """Sinusoids [sin(t w_i) | cos(t w_i)] with w_i = 10000^(-i / (width / 2)); an odd width ends in a zero column.
 
-    Returns:
-        (frames, width) float32, computed in float64.
+    They are (frames, width) float32, computed in float64.
     """
     half = width // 2
     omega = 10000.0 ** (-torch.arange(half, dtype=torch.float64) / half)

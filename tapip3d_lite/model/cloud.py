@@ -43,28 +43,15 @@ class Level:
 
     def cut(self, start: int, stop: int) -> Level:
         """Frames [start, stop)."""
-        return replace(
-            self,
-            features=self.features[:, start:stop],
-            points=self.points[:, start:stop],
-            valid=self.valid[:, start:stop],
-        )
+        features, points, valid = (x[:, start:stop] for x in (self.features, self.points, self.valid))
+        return replace(self, features=features, points=points, valid=valid)
 
 
 def feature_cloud(features: Tensor, points: Tensor, valid: Tensor, levels: int) -> list[Level]:
-    """Pair a pyramid of features with a pyramid of points.
+    """L levels, finest first, of features (B, T, C, h, w) with points (B, T, H, W, 3), valid (B, T, H, W) or not.
 
     Features are averaged 2 x 2 from level to level. Points are never averaged, since the mean of a front and a back
     point lies on neither: each cell takes the point of the full-resolution pixel nearest to its centre.
-
-    Args:
-        features: (B, T, C, h, w).
-        points: (B, T, H, W, 3).
-        valid: (B, T, H, W) bool.
-        levels: L.
-
-    Returns:
-        L levels, finest first.
     """
     batch, count = features.shape[:2]
     maps, cloud = features.flatten(0, 1), []  # (B T, C, h, w)
@@ -120,9 +107,7 @@ class Normalizer:
         weight = valid.flatten(1).unsqueeze(-1)  # (B, P, 1)
         count = weight.sum(1, keepdim=True)
         if check and not bool((count > 0).all()):
-            raise ValueError(
-                "depths: a window has no valid point inside depth_roi, so coordinates have no scale; widen depth_roi"
-            )
+            raise ValueError("depths: a window has no valid point in depth_roi, so there is no scale; widen depth_roi")
         flat = points.flatten(1, 3)  # (B, P, 3)
         mean = torch.where(weight, flat, 0).sum(1, keepdim=True) / count
         square = torch.where(weight, flat - mean, 0).square()

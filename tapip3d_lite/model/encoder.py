@@ -15,9 +15,8 @@ from torch import Tensor, nn
 
 from tapip3d_lite.model.config import TrackerConfig
 
-_PIXELS = (
-    2**18
-)  # encoded at once without gradient: frames are independent, so this only bounds memory; on a GPU 16 times
+# Encoded at once without gradient, on a GPU 16 times as many: frames are independent, so this only bounds memory.
+_PIXELS = 2**18
 
 
 class ResidualBlock(nn.Module):
@@ -53,14 +52,7 @@ class Encoder(nn.Module):
         self.head = nn.Conv2d(width * 2, width, 1)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Encode frames one by one.
-
-        Args:
-            rgb: (B, T, 3, H, W) in [0, 1].
-
-        Returns:
-            (B, T, C, H // stride, W // stride) float32.
-        """
+        """Encode frames (B, T, 3, H, W), in [0, 1], one by one: (B, T, C, H // stride, W // stride) float32."""
         images = rgb.flatten(0, 1)  # (B T, 3, H, W)
         budget = _PIXELS * (16 if rgb.is_cuda else 1)
         step = len(images) if torch.is_grad_enabled() else max(1, budget // rgb[0, 0, 0].numel())

@@ -111,23 +111,15 @@ def knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = None
 
 
 def _nearest(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) -> Tensor:
-    distance = squared_distances(queries, points)  # (F, N, P)
-    if valid is not None:
-        distance.masked_fill_(~valid[:, None], torch.inf)  # (F, 1, P)
+    distance = squared_distances(queries, points, valid)  # (F, N, P)
     return nearest_first(distance, torch.arange(distance.shape[-1], device=distance.device), count, valid is not None)
 
 
 def nearest_first(distance: Tensor, indices: Tensor, count: int, masked: bool) -> Tensor:
-    """The indices with the smallest distances, lowest index first among equals.
+    """The indices (F, N, K), of (P,) or (F, N, P) int64, with the smallest distances (F, N, P), nearest first.
 
-    Args:
-        distance: (F, N, P), not negative; infinite where a point may not be chosen.
-        indices: (P,) or (F, N, P) int64.
-        count: K.
-        masked: fill the slots of points that may not be chosen, see `knn`.
-
-    Returns:
-        (F, N, K) int64, nearest first.
+    Among equals the lowest index comes first. Distances are not negative, and infinite where a point may not be chosen;
+    with `masked` the slots of such points are filled, see `knn`.
     """
     # The bits of a non-negative float order like the float itself, so one integer holds (distance, index).
     key = (distance.view(torch.int32).long() << 32) + indices
@@ -138,12 +130,15 @@ def nearest_first(distance: Tensor, indices: Tensor, count: int, masked: bool) -
     return indices
 
 
-def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
-    """(F, N, P) = dx^2 + dy^2 + dz^2; never through |a|^2 + |b|^2 - 2ab, which loses the near ones to rounding."""
+def squared_distances(queries: Tensor, points: Tensor, valid: Tensor | None = None) -> Tensor:
+    """(F, N, P) = dx^2 + dy^2 + dz^2, infinite for points that are not valid (F, P).
+
+    Never through |a|^2 + |b|^2 - 2ab, which loses the near ones to rounding.
+    """
     total = (queries[:, :, None, 0] - points[:, None, :, 0]).square_()  # (F, N, 1) - (F, 1, P)
     for axis in (1, 2):
         total += (queries[:, :, None, axis] - points[:, None, :, axis]).square_()
-    return total
+    return total if valid is None else total.masked_fill_(~valid[:, None], torch.inf)  # (F, 1, P)
 
 
 def gather(values: Tensor, indices: Tensor) -> Tensor:

@@ -32,15 +32,9 @@ class Space:
         return self
 
     def lift(self, depths: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:
-        """Depth maps to point maps in this space.
+        """Depth maps (..., H, W) of cameras (..., 3, 3) and (..., 4, 4) to point maps (..., H, W, 3) in this space.
 
-        Args:
-            depths: (..., H, W).
-            intrinsics: (..., 3, 3).
-            extrinsics: (..., 4, 4).
-
-        Returns:
-            (..., H, W, 3); cells without depth lie at the camera's centre.
+        Cells without depth lie at the camera's centre.
         """
         return point_map(depths, intrinsics, extrinsics)
 

@@ -34,8 +34,6 @@ from tapip3d_lite.model.windows import Scene, State, Step, Window, query_support
 _CHUNK = 2**25  # floats of context tokens that exist at once without gradient: 128 MiB
 _CPU_CHUNK = 2**21  # on a CPU 8 MiB are twice as fast, since temporaries stay in the cache
 
-__all__ = ["Tracker", "TrackerConfig"]
-
 
 class Tracker(nn.Module):
     """Tracks any points of a posed RGB-D video in 3D.
@@ -207,16 +205,7 @@ class Tracker(nn.Module):
         return Window(scene, norm, levels, kept, active, columns, support)
 
     def update(self, window: Window, coords: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-        """Update the trajectories of one window once (equation 3).
-
-        Args:
-            window: from `window`.
-            coords: (B, S, n, 3) normalised.
-            logits: (B, S, n) visibility.
-
-        Returns:
-            The new coords and logits.
-        """
+        """Update one window's trajectories once (equation 3): normalised coords (B, S, n, 3) and logits (B, S, n)."""
         frames = window.scene.frames
         with torch.autocast(coords.device.type, enabled=False):
             uv = window.scene.space.to_pixels(window.norm.restore(coords), frames.intrinsics, frames.extrinsics)
@@ -228,15 +217,9 @@ class Tracker(nn.Module):
         return coords + delta[..., :3] * free, logits + delta[..., 3]
 
     def evidence(self, window: Window, coords: Tensor, uv: Tensor) -> Tensor:
-        """Collect each estimate's neighbourhood and compare it with the query's, at all levels.
+        """Collect each estimate's neighbourhood and compare it with the query's, at all levels: (B, S, n, L * width).
 
-        Args:
-            window: from `window`.
-            coords: (B, S, n, 3) normalised.
-            uv: (B, S, n, 2) pixels.
-
-        Returns:
-            (B, S, n, L * width).
+        Estimates are `coords` (B, S, n, 3), normalised, which lie at pixels `uv` (B, S, n, 2).
         """
         batch, frames, count = coords.shape[:3]
         floats = batch * frames * self.config.neighbors * self.config.token_dim * 4  # of one track

@@ -73,14 +73,10 @@ class Transformer(nn.Module):
             nn.init.zeros_(head.bias)
 
     def forward(self, tokens: Tensor, active: Tensor | None = None) -> Tensor:
-        """Propose corrections.
+        """Corrections (B, S, N, at least 4) from trajectory tokens (B, S, N, inputs).
 
-        Args:
-            tokens: (B, S, N, inputs) trajectory tokens.
-            active: (B, N) bool, tracks that exist; the others are seen by nobody. None: all.
-
-        Returns:
-            (B, S, N, at least 4): dx, dy, dz (normalised coordinates), change of the visibility logit.
+        They are dx, dy, dz (normalised coordinates) and the change of the visibility logit. `active` (B, N) bool says
+        which tracks exist, None: all; the others are seen by nobody.
         """
         points = self.input(tokens)  # (B, S, N, inputs) -> (B, S, N, U)
         batch, frames, count = points.shape[:3]

@@ -21,12 +21,9 @@ _FORMAT = "tapip3d_lite"
 
 
 def save_weights(tracker: Tracker, path: str | Path, half: bool = False) -> None:
-    """Write parameters and config as one safetensors file, atomically.
+    """Write parameters and config as one safetensors file, atomically; missing folders are made.
 
-    Args:
-        tracker: any.
-        path: of the file; missing folders are made.
-        half: store 16-bit floats, which halves the file; they are read back as 32-bit ones.
+    With `half` floats are stored in 16 bits, which halves the file; they are read back as 32-bit ones.
 
     Raises:
         ValueError: the tracker has a custom part, which no file can name.
@@ -38,12 +35,7 @@ def save_weights(tracker: Tracker, path: str | Path, half: bool = False) -> None
 
 
 def load_weights(path: str | Path, device: str = "cpu", fast: bool = True) -> Tracker:
-    """Read a tracker that `save_weights` wrote, in evaluation mode.
-
-    Args:
-        path: of the file.
-        device: where the tracker computes.
-        fast: use the fast forms of its parts, see `Tracker`.
+    """Read a tracker that `save_weights` wrote, in evaluation mode, to a device; `fast` as for `Tracker`.
 
     Raises:
         ValueError: missing, truncated or foreign file, or parameters that do not fit the config.
@@ -64,7 +56,5 @@ def load_weights(path: str | Path, device: str = "cpu", fast: bool = True) -> Tr
     try:
         tracker.load_state_dict(state)
     except RuntimeError as error:
-        raise ValueError(
-            f"{path}: parameters do not fit their config: {str(error).splitlines()[-1].strip()}"
-        ) from error
+        raise ValueError(f"{path}: parameters do not fit the config: {str(error).splitlines()[-1].strip()}") from error
     return tracker.to(device).eval()

@@ -21,6 +21,8 @@ from tapip3d_lite.model.cloud import Level, Normalizer
 from tapip3d_lite.model.frames import Frames
 from tapip3d_lite.model.neighbors import Neighbors, bilinear
 
+Neighborhood = Callable[..., Neighbors]  # as `KNearest.forward`
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -130,15 +132,12 @@ class State:
     @classmethod
     def start(cls, queries: Tensor, frames: Frames, space: Any, multiple: int, check: bool = True) -> State:
         """Trajectories that stand still at their queries (B, N, 4), given in the world; `check` their frames or not."""
-        if queries.ndim != 3 or queries.shape[0] != len(frames.depths) or queries.shape[2] != 4:
-            raise ValueError(
-                f"queries: expected ({len(frames.depths)}, N, 4) rows (t, x, y, z), got {tuple(queries.shape)}"
-            )
+        clips = len(frames.depths)
+        if queries.ndim != 3 or queries.shape[0] != clips or queries.shape[2] != 4:
+            raise ValueError(f"queries: expected ({clips}, N, 4) rows (t, x, y, z), got {tuple(queries.shape)}")
         times = queries[..., 0].long()
         if check and bool(((times < 0) | (times >= len(frames))).any()):
-            raise ValueError(
-                f"queries: t must be in [0, {len(frames) - 1}], got {int(times.min())}..{int(times.max())}"
-            )
+            raise ValueError(f"queries: t must be in [0, {len(frames) - 1}], got {times.min()}..{times.max()}")
         batch = torch.arange(len(queries), device=queries.device)[:, None]  # (B, 1)
         with torch.autocast(queries.device.type, enabled=False):
             cameras = frames.intrinsics[batch, times], frames.extrinsics[batch, times]  # (B, N, ...)
@@ -180,41 +179,30 @@ class State:
         self.logits[:, start:stop, columns] = torch.where(mask, logits, old[1])
 
 
-def query_support(
-    neighborhood: Callable[..., Neighbors], scene: Scene, times: Tensor, coords: Tensor
-) -> list[Neighbors]:
-    """Neighbourhoods of queries, each in the frame where it was asked.
+def query_support(neighborhood: Neighborhood, scene: Scene, times: Tensor, coords: Tensor) -> list[Neighbors]:
+    """Neighbourhoods of queries, each in the frame where it was asked: for each level (B, N, 1 + K, ...).
 
-    Args:
-        neighborhood: as `neighbors.KNearest.forward`.
-        scene: T frames.
-        times: (B, N) int64 query frames.
-        coords: (B, N, 3) queries in the scene's space.
-
-    Returns:
-        For each level (B, N, 1 + K, ...), see `around_queries`.
+    The query frames `times` (B, N) are int64, `coords` (B, N, 3) the queries in the scene's space.
     """
     supports = []
     for level in scene.levels:
         whole: dict[str, Tensor] = {}
         for frame in times.unique().tolist():
             columns = (times == frame).any(0).nonzero()[:, 0]  # (n,) asked here in any batch element
-            mine = (times[:, columns] == frame)[..., None, None]  # (B, n, 1, 1)
-            near = around_queries(
-                neighborhood, scene.cut(frame, frame + 1), level.cut(frame, frame + 1), coords[:, columns]
-            )
+            mine = times[:, columns] == frame  # (B, n)
+            here = scene.cut(frame, frame + 1), level.cut(frame, frame + 1)
+            near = around_queries(neighborhood, *here, coords[:, columns])
             for name in ("features", "points", "indices"):
-                new = getattr(near, name)
-                if new is not None:
-                    new = new[:, 0].unsqueeze(-1) if name == "indices" else new[:, 0]  # (B, n, 1 + K, ...)
+                if getattr(near, name) is not None:
+                    new = getattr(near, name)[:, 0]  # (B, n, 1 + K, ...)
                     total = whole.setdefault(name, new.new_zeros(*times.shape, *new.shape[2:]))
-                    total[:, columns] = torch.where(mine, new, total[:, columns])
-        indices = whole["indices"].squeeze(-1) if "indices" in whole else None
-        supports.append(Neighbors(whole["features"], whole["points"], coords, indices))
+                    fits = mine.view(*mine.shape, *[1] * (new.ndim - 2))  # (B, n, 1, ...)
+                    total[:, columns] = torch.where(fits, new, total[:, columns])
+        supports.append(Neighbors(**whole, center=coords))
     return supports
 
 
-def around_queries(neighborhood: Callable[..., Neighbors], scene: Scene, level: Level, coords: Tensor) -> Neighbors:
+def around_queries(neighborhood: Neighborhood, scene: Scene, level: Level, coords: Tensor) -> Neighbors:
     """Neighbourhoods (B, T, N, 1 + K, ...) of queries (B, N, 3) in each of T frames, the query itself first.
 
     That first row has the bilinear feature at the query's pixel and index -1.

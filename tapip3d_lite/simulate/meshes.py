@@ -6,8 +6,6 @@ outline pulled to a thickness; both keep every edge shared by exactly two faces.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -67,9 +65,7 @@ def blob(rng: np.random.Generator) -> Mesh:
     return _oriented(vertices * bumps, faces)
 
 
-MESHES: dict[str, Callable[[np.random.Generator], Mesh]] = {
-    f.__name__: f for f in (torus, gear, blob, star, bracket, vase, knot)
-}
+MESHES = {function.__name__: function for function in (torus, gear, blob, star, bracket, vase, knot)}
 
 
 def _polar(angle: np.ndarray, radius: np.ndarray | float) -> np.ndarray:

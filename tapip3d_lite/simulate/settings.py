@@ -68,11 +68,9 @@ class SimulationConfig:
         for name in tuples.split():
             object.__setattr__(self, name, tuple(getattr(self, name)))  # lists come from JSON and the command line
         self._require("frames tracks", lambda v: _whole(1, v), "a whole number of at least 1", "change it")
-        self._require("size", lambda v: len(v) == 2 and _whole(8, *v), "two whole numbers of at least 8", "change it")
-        self._require("moving", lambda v: len(v) == 2 and _whole(1, *v), "two whole numbers of at least 1", "change it")
-        self._require(
-            "resting", lambda v: len(v) == 2 and _whole(0, *v), "two whole numbers of at least 0", "change it"
-        )
+        for name, low in (("size", 8), ("moving", 1), ("resting", 0)):
+            wanted = f"two whole numbers of at least {low}"
+            self._require(name, lambda v, low=low: len(v) == 2 and _whole(low, *v), wanted, "change it")
         self._require("arc moving resting", lambda v: len(v) == 2 and v[0] <= v[1], "(least, greatest)", "sort them")
         self._require("resting", lambda v: v[1] + self.moving[1] <= 40, "at most 40 with the moving", "lower both")
         self._require("fps speed drop", lambda v: _number(v) and v > 0, "a positive number", "1 is the usual scale")

@@ -59,9 +59,7 @@ def run_knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = 
 
 
 def _nearest_of_runs(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) -> Tensor:
-    distance = squared_distances(queries, points)  # (F, N, P)
-    if valid is not None:
-        distance.masked_fill_(~valid[:, None], torch.inf)
+    distance = squared_distances(queries, points, valid)  # (F, N, P)
     indices = torch.arange(distance.shape[-1], device=distance.device)
     # The K nearest lie in the K runs of cells whose nearest ones are nearest, ties included: fewer are sorted.
     nearest = distance.unflatten(-1, (-1, _RUN)).amin(-1)  # (F, N, P / 8)
@@ -132,18 +130,7 @@ class BlockTree:
         return cls(levels, cells.flatten(0, -2).repeat(frames, 1), height * width, valid is not None)
 
     def knn(self, queries: Tensor, count: int) -> Tensor:
-        """Exact nearest neighbours by squared distance in float32; ties go to the lowest index.
-
-        Args:
-            queries: (F, N, 3).
-            count: K, at most h * w.
-
-        Returns:
-            (F, N, K) int64, as `model.neighbors.knn` gives for the flattened maps.
-
-        Raises:
-            ValueError: K exceeds the cells of a map.
-        """
+        """What `model.neighbors.knn` gives for queries (F, N, 3) and the flattened maps: (F, N, K) int64."""
         frames, number = queries.shape[:2]
         if count > self.total:
             raise ValueError(f"knn: asked for {count} neighbours among {self.total} cells; lower neighbors or levels")

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.model.neighbors import Neighbors
-from tapip3d_lite.model.windows import Scene, around_queries
+from tapip3d_lite.model.windows import Neighborhood, Scene, around_queries
 
 _WARM = 2  # runs before recording: they compile, and choose algorithms
 
@@ -39,19 +39,17 @@ class CudaGraphStep:
     """A step that adds gradients, recorded for each number of frames and updates that it meets.
 
     Each recording keeps a step's memory for itself, so a recipe of many lengths needs as many times as much.
+
+    Args:
+        step: from a batch and M to tensors; leaves gradients. A batch is anything with `frames` and `map(function of a
+            tensor)`.
+        tracker: which it trains; `sync_free` while it is recorded.
+        parameters: that get gradients.
     """
 
     def __init__(
         self, step: Callable[[Any, int], tuple[Tensor, ...]], tracker: nn.Module, parameters: Sequence[nn.Parameter]
     ) -> None:
-        """Prepare to record.
-
-        Args:
-            step: from a batch and M to tensors; leaves gradients. A batch is anything with `frames` and `map(function of a
-                tensor)`.
-            tracker: which it trains; `sync_free` while it is recorded.
-            parameters: that get gradients.
-        """
         self._step, self._tracker, self._parameters, self._recorded = step, tracker, list(parameters), {}
 
     def __call__(self, batch: Any, iterations: int) -> tuple[Tensor, ...]:
@@ -96,9 +94,7 @@ def _tensors(batch: Any) -> list[Tensor]:
     return tensors
 
 
-def support_at_once(
-    neighborhood: Callable[..., Neighbors], scene: Scene, times: Tensor, coords: Tensor
-) -> list[Neighbors]:
+def support_at_once(neighborhood: Neighborhood, scene: Scene, times: Tensor, coords: Tensor) -> list[Neighbors]:
     """As `model.windows.query_support`: all queries in all frames, of which each query's own frame is kept.
 
     That is T times the work, but T times fewer calls, and nothing depends on values.

@@ -71,10 +71,7 @@ class FoldedPair:
     @classmethod
     def fold(cls, context: N2N, index: int, kept: Tensor) -> FoldedPair:
         """Fold the weights of level `index` with its support tokens (B, N, 1 + K (+ 1), D), from `N2N.describe`."""
-        pair, offsets = (
-            context.pairs[index % len(context.pairs)],
-            context.embed.offsets[index % len(context.embed.offsets)],
-        )
+        pair, offsets = (parts[index % len(parts)] for parts in (context.pairs, context.embed.offsets))
         query = None
         if context.use_features:
             kept, query = kept[..., :-1, :], kept[..., -1, :]

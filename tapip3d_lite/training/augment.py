@@ -72,8 +72,9 @@ class AugmentConfig:
     def __post_init__(self) -> None:
         for name in ("erase_side", "blur_sigma", "depth_blur_sigma", "scale", "jitter_strength"):
             object.__setattr__(self, name, tuple(getattr(self, name)))  # lists come from JSON
-        check_range(self, 0, 1, "erase", "jitter", "blur", "depth_blur", "reframe", "flip_x", "flip_y")
-        check_range(self, 0, 1, "jitter_strength")
+        check_range(
+            self, 0, 1, "erase", "jitter", "jitter_strength", "blur", "depth_blur", "reframe", "flip_x", "flip_y"
+        )
         check_range(self, 0, math.inf, "pad", "drift")
         check_range(self, 1, math.inf, "erase_boxes")
         for name in ("erase_side", "blur_sigma", "depth_blur_sigma", "scale"):

@@ -21,11 +21,6 @@ from tapip3d_lite.model.windows import Step, Window
 from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
 
 
-def saving_backward(tracker: Tracker, *arguments: Any, **options: Any) -> dict[str, float]:
-    """Call `add_gradients`, and return the loss by name: `position`, `visibility` and their sum `loss`."""
-    return losses(add_gradients(tracker, *arguments, **options))
-
-
 def add_gradients(
     tracker: Tracker,
     frames: Frames,
@@ -100,16 +95,3 @@ class Leaves:
         self._pairs = []
         if pairs:
             torch.autograd.backward(*zip(*pairs, strict=True), retain_graph=retain_graph)
-
-
-def plain_backward(
-    tracker: Tracker, frames: Frames, queries: Tensor, truth: Truth, config: LossConfig, **options: Any
-) -> dict[str, float]:
-    """The same gradients by their definition: sum the losses of all updates, then backpropagate everything at once."""
-    iterations = options.get("iterations") or tracker.config.iterations
-    steps = tracker.steps(frames, queries, features=tracker.encoder(frames.rgb), **options)
-    parts = [torch.stack(step_loss(step, truth, iterations, config)) for step in steps]
-    total = torch.stack(parts).sum(0) if parts else queries.new_zeros(2)
-    if parts:
-        total.sum().backward()
-    return losses(total.detach())

@@ -70,17 +70,10 @@ class LossConfig:
 
 
 def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> tuple[Tensor, Tensor]:
-    """Position and visibility terms of one update, weighted and discounted.
+    """Position and visibility terms of one of M updates, weighted and discounted: two scalars whose sum is minimised.
 
-    Args:
-        step: from `Tracker.steps`.
-        truth: of all frames and tracks of the same batch.
-        iterations: M.
-        config: weights.
-
-    Returns:
-        Two scalars whose sum is minimised. Frames before the query, padded frames (repetitions of the last one) and
-        inactive tracks, which only fill up the batch, do not count.
+    `truth` has all frames and tracks of the batch. Frames before the query, padded frames (repetitions of the last one)
+    and inactive tracks, which only fill up the batch, do not count.
     """
     target, visible, counted, depth, focal = _compared(step, truth)
     depth = depth.clamp(min=0.1)
@@ -93,9 +86,8 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
     entropy = F.binary_cross_entropy_with_logits(step.logits, visible.to(step.logits.dtype), reduction="none")
     weight = config.scale * config.discount ** (iterations - 1 - step.iteration)
     # A mean over each clip, then over clips: so the mean over processes is the mean over all their clips.
-    position, visibility = (
-        ((x * counted).flatten(1).sum(1) / counted.flatten(1).sum(1).clamp(min=1)).mean() for x in (error, entropy)
-    )
+    total = counted.flatten(1).sum(1).clamp(min=1)
+    position, visibility = (((x * counted).flatten(1).sum(1) / total).mean() for x in (error, entropy))
     return weight * position, weight * config.visibility * visibility
 
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.files import load_npz
-from tapip3d_lite.geometry import project
+from tapip3d_lite.geometry import pixel_grid, project
 from tapip3d_lite.model.blocks import constant
 from tapip3d_lite.training.augment import AugmentConfig, augment
 from tapip3d_lite.training.data import pick_frames
@@ -145,8 +145,7 @@ def _pair_loss(maps: Tensor, pair: FramePair, config: MatchingConfig) -> tuple[T
             break
         cells = pair.uv * constant((float(width), float(height)), pair.uv) / size
         scores = _similarity(maps, cells[0])
-        columns, rows = (torch.arange(n, device=pair.uv.device, dtype=torch.float32) for n in (width, height))
-        places = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).flatten(0, 1)  # (h w, 2), row by row
+        places = pixel_grid(height, width, like=pair.uv).flatten(0, 1)  # (h w, 2), row by row
         apart = (places - cells[1][:, None]).square().sum(-1)  # (N, h w)
         target = (-apart / (2 * config.spread**2)).softmax(-1)
         loss = -(target * scores.log_softmax(-1)).sum(-1).mean()

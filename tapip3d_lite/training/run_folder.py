@@ -35,9 +35,7 @@ class RunFolder:
             write_text(recipe, json.dumps(wanted, indent=2) + "\n")
             return
         if not resume:
-            raise ValueError(
-                f"train: {path} holds a training already; continue it with --resume, or choose another folder"
-            )
+            raise ValueError(f"train: {path} holds a training already; continue with --resume or choose another folder")
         stored = TrainConfig.from_dict(json.loads(recipe.read_text())).to_dict()
         different = [f"{k}={stored[k]!r} (now {v!r})" for k, v in wanted.items() if stored[k] != v]
         if different:

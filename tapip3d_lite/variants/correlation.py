@@ -25,15 +25,12 @@ class Correlation(Context):
 
     def __init__(self, config: TrackerConfig) -> None:
         super().__init__()
-        count = config.neighbors
-        inputs = count * count + (count if config.depth_ratio else 0)
+        inputs = config.neighbors * (config.neighbors + config.depth_ratio)
         self.depth_ratio, self.width = config.depth_ratio, config.token_dim
-        copies = 1 if config.share_levels else config.levels
-        hidden = 3 * config.token_dim // 2
-        layers = (
+        copies, hidden = 1 if config.share_levels else config.levels, 3 * config.token_dim // 2
+        self.mlps = nn.ModuleList(
             nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, self.width)) for _ in range(copies)
         )
-        self.mlps = nn.ModuleList(layers)
 
     def describe(self, index: int, support: Neighbors) -> Tensor:
         """The window around the query (B, N, K, C), without the row of the query itself, which is its middle."""

@@ -7,6 +7,7 @@ context(x)_k = sum over planes of <f_query, plane(place of x + step k)> / sqrt(C
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -51,13 +52,8 @@ class PlaneCorrelation(Context):
     def __init__(self, config: TrackerConfig) -> None:
         super().__init__()
         self.width = config.neighbors
-        channels = config.feature_dim
-        self.smooth = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, channels, 3, padding=1)
-            )
-            for _ in range(2)
-        )
+        convolution = partial(nn.Conv2d, config.feature_dim, config.feature_dim, 3, padding=1)
+        self.smooth = nn.ModuleList(nn.Sequential(convolution(), nn.ReLU(), convolution()) for _ in range(2))
 
     def prepare(self, index: int, level: Level) -> Level:
         """Splat the cloud onto the (x, z) and (y, z) planes and smooth them with two convolutions each."""
@@ -80,17 +76,10 @@ class PlaneCorrelation(Context):
 
 
 def splat(features: Tensor, points: Tensor, valid: Tensor, axes: tuple[int, int], side: int) -> Tensor:
-    """Average features onto an orthogonal plane: each cell is the mean of the cloud's cells that project into it.
+    """Average features (F, P, C) onto a plane (F, n, n, C): each cell is the mean of the cloud's that project into it.
 
-    Args:
-        features: (F, P, C).
-        points: (F, P, 3) normalised.
-        valid: (F, P) bool.
-        axes: which coordinates give column and row.
-        side: n.
-
-    Returns:
-        (F, n, n, C), 0 where nothing projects.
+    It is 0 where nothing does. Normalised points (F, P, 3) count where they are valid (F, P); two of their coordinates,
+    `axes`, give column and row; n is `side`.
     """
     place = ((points[..., list(axes)].detach() / (2 * EXTENT) + 0.5) * (side - 1)).round()
     inside = valid & ((place >= 0) & (place <= side - 1)).all(-1)

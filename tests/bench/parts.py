@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
+from lessons.backward_ways import plain_backward, saving_backward
 from lessons.saved_bytes import SavedBytes
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.model import track as inference
@@ -28,7 +29,6 @@ from tapip3d_lite.model.neighbors import knn
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.simulate import simulate_clip
 from tapip3d_lite.speed.box_knn import BlockTree
-from tapip3d_lite.training.backward import plain_backward, saving_backward
 from tapip3d_lite.training.data import training_clips
 from tapip3d_lite.training.loss import LossConfig, Truth
 from tapip3d_lite.training.recipe import TrainConfig
