@@ -7,7 +7,7 @@ the truth is known, `tracks`, `visible` and `dynamic`. Tracks on disk are the au
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -181,14 +181,7 @@ def load_clip(path: str | Path, points: bool = True) -> Clip:
     Raises:
         ValueError: the file is missing, truncated, not an npz, needs pickle, or its arrays do not fit together.
     """
-    arrays = load_npz(path)
-    remedy = "for RGB-only video estimate depth and pose first (e.g. with MegaSaM)"
-    _require(path, arrays, "a clip", _CLIP_KEYS, remedy)
-    frames = len(arrays["video"]) if arrays["video"].ndim else 0
-    for key in ("intrinsics", "extrinsics"):
-        if arrays[key].ndim == 2:
-            arrays[key] = np.repeat(arrays[key][None], frames, axis=0)
-    tracks = None
+    arrays, tracks = clip_arrays(path), None
     if points and "tracks" in arrays:
         _require(path, arrays, "a clip with tracks", ("visible", "query_point"), "add the key or drop tracks")
         tracks = Tracks(arrays["tracks"], arrays["visible"], arrays["query_point"], None, arrays.get("dynamic"))
@@ -196,10 +189,22 @@ def load_clip(path: str | Path, points: bool = True) -> Clip:
         **{key: arrays[key] for key in _CLIP_KEYS},
         queries=arrays.get("query_point") if points else None,
         tracks=tracks,
-        name=str(arrays["name"]) if "name" in arrays else Path(path).stem,
-        fps=float(arrays["fps"]) if "fps" in arrays else 12.0,
+        name=str(arrays["name"]),
+        fps=float(arrays["fps"]),
         extras={key: value for key, value in arrays.items() if key not in _OWN_KEYS},
     )
+
+
+def clip_arrays(path: str | Path, skip: Collection[str] = (), outline: Collection[str] = ()) -> dict[str, np.ndarray]:
+    """The arrays of a clip's file, with a camera for each frame, `name` and `fps`; `skip`, `outline` as for `load_npz`."""
+    arrays = load_npz(path, skip, outline)
+    remedy = "for RGB-only video estimate depth and pose first (e.g. with MegaSaM)"
+    _require(path, arrays, "a clip", [key for key in _CLIP_KEYS if key not in skip], remedy)
+    frames = len(arrays["depths"]) if arrays["depths"].ndim else 0
+    for key in ("intrinsics", "extrinsics"):
+        if arrays[key].ndim == 2:
+            arrays[key] = np.repeat(arrays[key][None], frames, axis=0)
+    return {"name": np.array(Path(path).stem), "fps": np.array(12.0)} | arrays
 
 
 def load_tracks(path: str | Path) -> Tracks:

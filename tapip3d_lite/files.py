@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,21 +40,28 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def load_npz(path: str | Path, skip: Collection[str] = ()) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, apart from those to skip; a missing, truncated, pickled or foreign file is a ValueError."""
+def load_npz(path: str | Path, skip: Collection[str] = (), outline: Collection[str] = ()) -> dict[str, np.ndarray]:
+    """The arrays of an npz file without those to skip, only zeros for an `outline`; an unreadable file is a ValueError."""
     try:
         # An open file of our own: np.load leaks the one it opens when the zip turns out to be broken.
         with open(path, "rb") as file:
             data = np.load(file, allow_pickle=False)
             if not isinstance(data, np.lib.npyio.NpzFile):
                 raise ValueError("it holds one bare array, not named ones")
-            return {key: data[key] for key in data.files if key not in skip}
+            return {k: _outline(data, k) if k in outline else data[k] for k in data.files if k not in skip}
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; check the path") from None
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError, NotImplementedError) as error:
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError) as error:
         raise ValueError(
             f"{path}: not a readable npz ({error}); it may be truncated, pickled or of another format"
         ) from error
+
+
+def _outline(data: np.lib.npyio.NpzFile, key: str) -> np.ndarray:
+    with data.zip.open(f"{key}.npy") as file:
+        major, minor = np.lib.format.read_magic(file)
+        shape, _, dtype = getattr(np.lib.format, f"read_array_header_{major}_{minor}")(file)
+    return np.broadcast_to(np.zeros((), dtype), shape)
 
 
 def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray | None]) -> None:

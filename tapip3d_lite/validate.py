@@ -59,6 +59,13 @@ def bools(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
     return array.astype(bool, copy=False)
 
 
+def check_depths(depths: np.ndarray, window: int) -> None:
+    """Raise ValueError if in some window of depths (T, H, W) hardly any is known, so that coordinates have no scale."""
+    known = (depths > 0).mean((1, 2))
+    if np.convolve(known, np.ones(window), "valid").min() < 1e-3 * window:
+        raise ValueError(f"Clip.depths: {window} consecutive frames have no valid pixel; leave those frames out")
+
+
 def check_range(config: object, low: float, high: float, *names: str) -> None:
     """Raise ValueError unless these fields of a config, each a number or a tuple of numbers, are in [low, high]."""
     for name in names:

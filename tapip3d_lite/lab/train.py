@@ -20,6 +20,7 @@ from tapip3d_lite.training.data import training_clips, validation_clips
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.run_folder import RunFolder
 from tapip3d_lite.training.trainer import Trainer
+from tapip3d_lite.validate import check_depths
 
 _SCORES = ("AJ3D_none", "APD3D_none", "OA", "AJ3D_none_dynamic", "APD3D_none_dynamic", "APD3D_none_static")
 
@@ -28,12 +29,17 @@ def held_out_scores(clips: Sequence[Clip]) -> Callable[[Tracker], dict[str, floa
     """A function that gives a tracker's mean scores on held-out clips in world space, with names that begin `val_`.
 
     Args:
-        clips: with true tracks; not trained on.
+        clips: with true tracks; not trained on. If none says which points move, there are no scores of these.
+
+    Raises:
+        ValueError: a clip without true tracks.
     """
+    for clip in clips:
+        evaluate(clip.tracks, clip)  # what cannot be scored is refused now, not in the middle of a training
 
     def validate(tracker: Tracker) -> dict[str, float]:
-        scores = mean_scores([evaluate(tracker.track(clip), clip) for clip in clips])
-        return {f"val_{name}": round(scores[name], 4) for name in _SCORES}
+        scores = mean_scores([evaluate(tracker.track(clip, clip.tracks.queries), clip) for clip in clips])
+        return {f"val_{name}": round(scores[name], 4) for name in _SCORES if name in scores}
 
     return validate
 
@@ -53,6 +59,8 @@ def make_trainer(
     Raises:
         ValueError: as `Trainer` does.
     """
+    for clip in validation:
+        check_depths(clip.depths, config.tracker_config().window)
     return Trainer(folder, config, clips, held_out_scores(validation) if validation else None, **options)
 
 

@@ -13,20 +13,22 @@ import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tapip3d_lite.clip import Clip, Tracks, load_clip
+from tapip3d_lite.clip import Clip, Tracks, clip_arrays, load_clip
 from tapip3d_lite.files import atomic_path, load_npz
+from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.encoder import Encoder
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
 from tapip3d_lite.simulate.seeds import TRAINING, VALIDATION
 from tapip3d_lite.training.loss import Truth
-from tapip3d_lite.validate import check_range
+from tapip3d_lite.validate import check_range, floats, video_frames
 
 
 def training_config(seed: int) -> SimulationConfig:
@@ -100,16 +102,50 @@ class SamplingConfig:
         check_range(self, 0, 1, "seen", "anywhere", "backward")
 
 
-def draw_frames(rng: np.random.Generator, available: int, wanted: int, backward: float) -> np.ndarray:
-    """Draw T = `wanted` consecutive frames, with probability `backward` from last to first: indices (T,).
+def true_tracks(arrays: Mapping[str, np.ndarray], index: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, N, 3) in some frames of a stored clip, NaN where unknown, and which are visible, in the image."""
+    xyz, visible, *cameras = (arrays[name][index] for name in ("tracks", "visible", "intrinsics", "extrinsics"))
+    xyz = np.where(np.isfinite(xyz).all(-1, keepdims=True), xyz, np.nan)
+    return xyz, visible.astype(bool) & in_image(xyz, *cameras, arrays["depths"].shape[1:])
 
-    A clip with fewer available frames is a ValueError.
-    """
-    if wanted > available:
-        raise ValueError(f"frames: an example needs {wanted} frames, the clip has {available}; lower frames")
-    start = int(rng.integers(available - wanted + 1))
-    index = np.arange(start, start + wanted)
-    return index[::-1].copy() if rng.random() < backward else index
+
+def usable_starts(visible: np.ndarray, wanted: int, seen: float) -> np.ndarray:
+    """Where in (T, N) `wanted` consecutive frames may begin: in a share `seen` of them some point is visible."""
+    if wanted > len(visible):
+        raise ValueError(f"{len(visible)} frames, but an example has up to {wanted}; lower `frames`")
+    total = np.cumsum(np.pad(visible, ((1, 0), (0, 0))), 0)
+    starts = np.flatnonzero(((total[wanted:] - total[:-wanted]) / wanted >= max(seen, 1 / wanted)).any(1))
+    if not len(starts):
+        raise ValueError(f"no track is visible, inside the image, in {seen:.0%} of any {wanted} frames; lower `seen`")
+    return starts
+
+
+def fault(path: Path, lengths: Iterable[int], seen: float) -> str | None:
+    """Why examples of these lengths cannot be drawn from a clip, or None; of images and depths only the sizes are read."""
+    try:
+        arrays = clip_arrays(path, outline=("video", "depths"))
+        if not {"tracks", "visible"} <= arrays.keys():
+            raise ValueError("no `tracks` and `visible`; a training needs true tracks, so leave this clip out")
+        video, xyz = video_frames(arrays["video"]), arrays["tracks"]
+        floats("depths", arrays["depths"], video.shape[:3], like="video (T, H, W, 3)")
+        tracks = Tracks(xyz, arrays["visible"], np.zeros((*xyz.shape[1:2], 4)), dynamic=arrays.get("dynamic"))
+        pixel, cameras = (video[:, :1, :1], np.ones((len(video), 1, 1))), (arrays["intrinsics"], arrays["extrinsics"])
+        Clip(*pixel, *cameras, np.empty((0, 4)), tracks, fps=float(arrays["fps"]))  # which checks the rest
+        xyz, visible = true_tracks(arrays)
+        if wrong := np.count_nonzero(tracks.visible & np.isnan(xyz[..., 0])):
+            raise ValueError(f"tracks: {wrong} positions are NaN where `visible` is true; set it false there")
+        for wanted in lengths:
+            usable_starts(visible, wanted, seen)
+    except ValueError as error:
+        return f"{path}: {str(error).removeprefix(f'{path}: ')}"
+    return None
+
+
+def draw_frames(arrays: dict[str, np.ndarray], rng: np.random.Generator, n: int, config: SamplingConfig) -> np.ndarray:
+    """Draw n consecutive frames of a stored clip that show enough of a point, maybe from last to first: indices (n,)."""
+    starts = usable_starts(true_tracks(arrays)[1], n, config.seen)
+    index = starts[rng.integers(len(starts))] + np.arange(n)
+    return index[::-1].copy() if rng.random() < config.backward else index
 
 
 def query_rows(xyz: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -146,8 +182,9 @@ def pick_frames(arrays: Mapping[str, np.ndarray], index: np.ndarray, size: tuple
     """
     frames = {name: arrays[name][index] for name in ("depths", "intrinsics", "extrinsics")}
     video = arrays["video"][index] if "video" in arrays else np.zeros((*frames["depths"].shape, 3), np.uint8)
-    kept = arrays["visible"][index].any(0)
-    xyz, visible = (arrays[name][index][:, kept] for name in ("tracks", "visible"))
+    xyz, visible = true_tracks(arrays, index)
+    kept = visible.any(0)
+    xyz, visible = xyz[:, kept], visible[:, kept]
     dynamic = arrays["dynamic"][kept] if "dynamic" in arrays else None
     tracks = Tracks(xyz, visible, query_rows(xyz, visible.argmax(0)), dynamic=dynamic)
     clip = Clip(video, **frames, tracks=tracks, name=str(arrays["name"]), fps=float(arrays["fps"]))
@@ -225,12 +262,12 @@ class FeatureCache:
     def check_room(self, clips: Sequence[Path]) -> None:
         """Raise a ValueError with the sizes if the features of these clips do not fit on the disk."""
         maps = self.encoder.head.out_channels * math.prod(side // self.encoder.stride for side in self.size)
-        frames = len(load_npz(clips[0], skip=("video", "tracks", "visible"))["depths"])
-        missing = sum(not self._path(clip).exists() for clip in clips)
-        needed, free = missing * frames * maps * 2, shutil.disk_usage(self.folder.parent).free
+        missing = [clip for clip in clips if not self._path(clip).exists()]
+        frames = sum(len(load_npz(clip, ("video", "tracks", "visible"), ("depths",))["depths"]) for clip in missing)
+        needed, free = frames * maps * 2, shutil.disk_usage(self.folder.parent).free
         if needed > free:
             raise ValueError(
-                f"train: the features of {missing} clips take {needed / 1e9:.1f} GB in {self.folder}, where "
+                f"train: the features of {len(missing)} clips take {needed / 1e9:.1f} GB in {self.folder}, where "
                 f"{free / 1e9:.1f} GB are free; use fewer clips, another folder, or train the encoder along"
             )
 

@@ -25,7 +25,7 @@ class Truth:
     """The true tracks of a batch.
 
     Attributes:
-        xyz: (B, T, N, 3) positions, world.
+        xyz: (B, T, N, 3) positions, world; NaN where a hidden point's is unknown, which counts as no error.
         visible: (B, T, N) bool.
         times: (B, N) int64, frames of the queries; only frames from there on count.
     """
@@ -122,6 +122,7 @@ def _compared(step: Step, truth: Truth) -> tuple[Tensor, ...]:
     index = torch.arange(step.start, step.start + len(frames), device=step.coords.device)
     real = index.clamp(max=last)
     target, visible = (x[:, real][:, :, step.columns] for x in (truth.xyz, truth.visible))
+    target = torch.where(target.isfinite(), target, step.xyz.detach())
     counted = (index[None, :, None] >= truth.times[:, None, step.columns]) & step.active[:, None]
     counted = counted & (index <= last)[None, :, None]
     focal = (frames.intrinsics[..., 0, 0] * frames.intrinsics[..., 1, 1]).sqrt()[..., None]

@@ -17,8 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from tapip3d_lite.clip import Clip
-from tapip3d_lite.files import load_npz
+from tapip3d_lite.clip import Clip, clip_arrays
 from tapip3d_lite.geometry import pixel_grid, project
 from tapip3d_lite.model.blocks import constant
 from tapip3d_lite.training.augment import AugmentConfig, augment
@@ -83,9 +82,11 @@ def draw_pair(
     """Draw two frames, resized to (H, W), of a stored clip with tracks, and points that are visible in both.
 
     The tracker's augmentation is used where enough points stay visible; without one the frames are only mirrored, and
-    their brightness and contrast changed by `jitter`.
+    their brightness and contrast changed by `jitter`. Frames that share no point are a ValueError.
     """
     clip, points = _two_frames(path, rng, config.gap, size)
+    if not len(points):
+        raise ValueError("no point is visible in both of two consecutive frames")
     if augmentation is not None:
         changed = augment(clip, rng, augmentation)
         left = np.flatnonzero(changed.tracks.visible.all(0))
@@ -111,7 +112,7 @@ def _vary(rgb: np.ndarray, uv: np.ndarray, rng: np.random.Generator, jitter: flo
 
 def _two_frames(path: Path, rng: np.random.Generator, gap: int, size: tuple[int, int]) -> tuple[Clip, np.ndarray]:
     """Frames at most `gap` apart, less where they share too few points, and the points visible in both."""
-    arrays = load_npz(path)
+    arrays = clip_arrays(path)
     available = len(arrays["depths"])
     while True:
         distance = min(int(rng.integers(1, gap + 1)), available - 1)

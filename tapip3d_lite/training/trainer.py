@@ -24,7 +24,7 @@ from tapip3d_lite.model.weights import load_weights, save_weights
 from tapip3d_lite.model.windows import Step
 from tapip3d_lite.training.backward import add_gradients, losses
 from tapip3d_lite.training.data import Batch, FeatureCache
-from tapip3d_lite.training.examples import Examples
+from tapip3d_lite.training.examples import Examples, check_clips
 from tapip3d_lite.training.loss import accuracy, step_accuracy
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.pretrain import FramePair, matching_loss
@@ -72,13 +72,12 @@ class Trainer:
             compiled: compile the tracker's parts, which takes minutes and then makes each step faster (GPU).
 
         Raises:
-            ValueError: no clips; the folder holds a training already (without `resume`) or one of another recipe; no
-                room for features; weights of other sizes to start from.
+            ValueError: no clips, or unusable ones; the folder holds a training already (without `resume`) or one of
+                another recipe; no room for features; weights of other sizes to start from.
         """
         if workers < 0:
             raise ValueError(f"Trainer: workers must not be negative, got {workers}; 0 makes examples in this process")
-        if not clips:
-            raise ValueError("Trainer: no training clips; make some with `training_clips` or `simulate`")
+        clips = check_clips(clips, config)  # before there is a folder
         self.config, self.validate, self.device, self.workers = config, validate, device, workers
         self.folder = RunFolder(folder, config, resume)
         with torch.random.fork_rng():  # leaves the caller's random generator as it is
