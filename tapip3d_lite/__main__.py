@@ -37,7 +37,9 @@ def track(
     own_queries: Annotated[bool, arg(help="use the clip's own queries where it has some")] = True,
     space: Annotated[str, arg(help="world or camera (learnt trackers)")] = "world",
     size: Annotated[tuple[int, int] | None, arg(help="height and width to look at (learnt trackers)")] = None,
-    crop: Annotated[tuple[int, int, int, int] | None, arg(help="left, top, right, bottom to look at, in pixels")] = None,
+    crop: Annotated[
+        tuple[int, int, int, int] | None, arg(help="left, top, right, bottom to look at, in pixels")
+    ] = None,
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
 ) -> None:
     """Track the points of a clip (npz) in 3D."""
@@ -80,7 +82,9 @@ def evaluate(
 
 def benchmark(
     tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("lite", "static", "klt"),
-    split: Annotated[tuple[str, ...], arg(help="by default the first three; the others are hard: " + ", ".join(ALL))] = SPLITS,
+    split: Annotated[
+        tuple[str, ...], arg(help="by default the first three; the others are hard: " + ", ".join(ALL))
+    ] = SPLITS,
     space: Annotated[tuple[str, ...], arg(help="world, camera or both (learnt trackers)")] = ("world",),
     count: Annotated[int | None, arg(help="only the first clips of each split")] = None,
     out: Annotated[Path | None, arg(help="JSON with every clip's scores; an interrupted run is continued")] = None,

@@ -383,7 +383,9 @@ def test_the_released_configuration_loads(size):
     cfg = {"model": RELEASED} | ({"train_dataset": {"resolution": list(size)}} if size else {})
     loaded = from_official_state(cfg, state | {"time_emb": ours.time[None]})
     assert (
-        loaded.config == ours.config.replace(as_released=True) and loaded.config.heads == 8 and loaded.config.head_dim == 48
+        loaded.config == ours.config.replace(as_released=True)
+        and loaded.config.heads == 8
+        and loaded.config.head_dim == 48
     )
     assert all(torch.equal(x, own[name]) for name, x in loaded.state_dict().items())
     assert sum(p.numel() for p in loaded.parameters()) == pytest.approx(25.7e6, rel=0.01)
@@ -509,7 +511,11 @@ def test_image_depth_and_camera_of_a_resized_clip_agree(size):
 
 
 def test_only_the_released_model_keeps_the_released_rule(golden, clip, monkeypatch):
-    assert golden.tracker.config.as_released and not TrackerConfig().as_released and not TrackerConfig.preset("lite").as_released
+    assert (
+        golden.tracker.config.as_released
+        and not TrackerConfig().as_released
+        and not TrackerConfig.preset("lite").as_released
+    )
     tracker, larger, rules = golden.tracker, resize_clip(clip, (96, 128)), []
     for module in (track, stream):
         spy = lambda clip, size, corners: rules.append(corners) or resize_clip(clip, size, corners)  # noqa: E731

@@ -101,7 +101,10 @@ def test_a_loss_that_is_not_finite_stops_with_its_batch(tmp_path, clips):
 
 def test_training_overfits_one_clip(tmp_path, clips):
     whole = {"sampling": SamplingConfig(tracks=24, seen=0.0, anywhere=0.0, backward=0.0), "frames": (8, 8)}
-    world = {"motion": MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0), "sensor": 0.0}  # so every step sees the same example
+    world = {
+        "motion": MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0),
+        "sensor": 0.0,
+    }  # so every step sees the same example
     config = recipe(matching_steps=0, steps=150, lr=2e-3, save_every=1000, head=1e-3, **whole, **world)
     trainer = Trainer(tmp_path, config, clips[:1])
     assert trainer.run(progress=False)

@@ -130,7 +130,12 @@ class Trainer:
             due = halted or self.schedule.finished or self.step % self.config.save_every == 0
             if due and self.group.is_main:
                 state = {"model": self.tracker.state_dict(), "optimizer": self.optimizer.state_dict()}
-                state |= {"average": self.average.state_dict(), "step": self.step, "position": self.schedule.position, "seconds": self.seconds}
+                state |= {
+                    "average": self.average.state_dict(),
+                    "step": self.step,
+                    "position": self.schedule.position,
+                    "seconds": self.seconds,
+                }
                 self.folder.save(state)
         if self.schedule.finished and self.group.is_main:
             save_weights(self.average, self.folder.path / "weights.safetensors", half=True)
