@@ -67,7 +67,7 @@ class SensorConfig:
             "grazing": (3.0, 15.0),
             "dropout": (0.02, 0.6),
         } | ({"blur": (0.3, 2.5)} if images else {})
-        return cls(**{k: float(np.exp(rng.uniform(*np.log(v)))) for k, v in ranges.items() if rng.random() < share})
+        return cls(**{name: log_uniform(rng, bounds) for name, bounds in ranges.items() if rng.random() < share})
 
 
 def degrade(clip: Clip, config: SensorConfig, seed: int | np.random.Generator = 0) -> Clip:
@@ -80,11 +80,12 @@ def degrade(clip: Clip, config: SensorConfig, seed: int | np.random.Generator = 
     """
     rng, unit = np.random.default_rng(seed), clip.size[1] / 128
     depths = clip.depths
-    edge = _silhouettes(depths) if config.flying or config.shadow else None
+    if config.flying or config.shadow:
+        near, far = _each(cv2.erode, depths), _each(cv2.dilate, depths)
+        edge = (far - near) > _EDGE * np.maximum(near, 1e-3)  # silhouettes: two surfaces in a neighbourhood
     away = _grazing(clip, config.grazing) if config.grazing else None
     shape = depths.shape
     if config.flying:
-        near, far = _each(cv2.erode, depths), _each(cv2.dilate, depths)
         mixed = near + rng.random(shape, np.float32) * (far - near)
         depths = np.where(edge & (rng.random(shape) < config.flying) & (depths > 0) & (near > 0), mixed, depths)
     scale = np.exp(config.flicker * rng.standard_normal((len(depths), 1, 1)))
@@ -105,6 +106,11 @@ def degrade(clip: Clip, config: SensorConfig, seed: int | np.random.Generator = 
     if config.blur:
         video = np.stack([cv2.GaussianBlur(frame, (0, 0), config.blur * unit) for frame in video])
     return replace(clip, depths=depths, video=video)
+
+
+def log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    """A number between two bounds whose logarithm is drawn uniformly: each order of magnitude is as likely."""
+    return float(np.exp(rng.uniform(*np.log(bounds))))
 
 
 def wrong_poses(clip: Clip, degrees: float, seed: int | np.random.Generator = 0, drift: float = 0.1) -> Clip:
@@ -144,12 +150,6 @@ def move(clip: Clip, motion: np.ndarray) -> Clip:
 def _each(change: object, depths: np.ndarray) -> np.ndarray:
     """A 3 x 3 operation of OpenCV on each frame."""
     return np.stack([change(frame, np.ones((3, 3), np.uint8)) for frame in depths])
-
-
-def _silhouettes(depths: np.ndarray) -> np.ndarray:
-    """Pixels (T, H, W) whose neighbourhood holds two surfaces."""
-    near, far = _each(cv2.erode, depths), _each(cv2.dilate, depths)
-    return (far - near) > _EDGE * np.maximum(near, 1e-3)
 
 
 def _widened(mask: np.ndarray, width: float) -> np.ndarray:

@@ -26,6 +26,7 @@ from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.encoder import Encoder
 from tapip3d_lite.model.frames import Frames, frames_from_clip, resize_clip
 from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
+from tapip3d_lite.simulate.degrade import log_uniform
 from tapip3d_lite.simulate.seeds import TRAINING, VALIDATION
 from tapip3d_lite.training.loss import Truth
 from tapip3d_lite.validate import check_range, floats, video_frames
@@ -37,7 +38,7 @@ def training_config(seed: int) -> SimulationConfig:
     Slow motion comes from the frame rate: at 240 frames a second a rolling ball creeps.
     """
     rng = np.random.default_rng([7, seed])
-    slow = np.exp(rng.uniform(np.log(24), np.log(300)))
+    slow = log_uniform(rng, (24.0, 300.0))
     return SimulationConfig(
         fps=float(rng.choice([12.0, 12.0, 24.0, slow])),
         camera=("static", "linear", "arc", "handheld")[seed % 4],

@@ -15,7 +15,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert
-from tapip3d_lite.simulate.degrade import move, pose_error
+from tapip3d_lite.simulate.degrade import log_uniform, move, pose_error
 from tapip3d_lite.validate import check_range
 
 
@@ -89,7 +89,7 @@ def random_coordinates(clip: Clip, rng: np.random.Generator, config: MotionConfi
     extrinsics = clip.extrinsics.astype(np.float64)
     kind = rng.random()
     if rng.random() < config.wrong:
-        error = pose_error(rng, frames, _log_uniform(rng, config.pose_noise))
+        error = pose_error(rng, frames, log_uniform(rng, config.pose_noise))
         motion = invert(error @ extrinsics) @ extrinsics
     if config.world <= kind < config.world + config.turned:
         turn = np.eye(4)
@@ -99,7 +99,7 @@ def random_coordinates(clip: Clip, rng: np.random.Generator, config: MotionConfi
         still = rng.random() < config.still
         motion = (np.eye(4) if still else smooth_motion(rng, frames, config)) @ extrinsics
     if rng.random() < config.sliding:
-        motion = slide(rng, frames, _log_uniform(rng, config.slide)) @ motion
+        motion = slide(rng, frames, log_uniform(rng, config.slide)) @ motion
     return move(clip, np.broadcast_to(motion, (frames, 4, 4)))
 
 
@@ -109,10 +109,6 @@ def slide(rng: np.random.Generator, frames: int, speed: float) -> np.ndarray:
     motion = np.repeat(np.eye(4)[None], frames, 0)
     motion[:, :3, 3] = np.arange(frames)[:, None] * speed * direction / np.linalg.norm(direction)
     return motion
-
-
-def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
-    return float(np.exp(rng.uniform(*np.log(bounds))))
 
 
 def _random_rotation(rng: np.random.Generator) -> np.ndarray:
