@@ -157,9 +157,10 @@ def card(
     name: Annotated[str, arg(help="of the model")] = "lite",
     weights: Annotated[Path | None, arg(help="the file, if not the folder's own")] = None,
     command: Annotated[str | None, arg(help="that made it, shown beside the recipe")] = None,
+    also: Annotated[Path | None, arg(help="Markdown file to put before the limits")] = None,
 ) -> None:
     """Write the model card of a training folder and of results that `benchmark --out` wrote."""
-    write_text(out, model_card(folder, results, hardware, name, command, weights))
+    write_text(out, model_card(folder, results, hardware, name, command, weights, also))
     print(f"wrote {out}")
 
 

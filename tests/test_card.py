@@ -62,6 +62,11 @@ def test_every_number_comes_from_the_files(folder, results):
         log.write('{"step": 15, "stage": "tracking", "seconds": 1.0}\n')
     text = model_card(folder, folder / "bench.json", "two cores of a toaster", command="torchrun x")
     assert "torchrun x\n" in text and "stopped at step 15 of 16" in text
+    (folder / "also.md").write_text("Slides by a mile.\n")
+    text = model_card(folder, folder / "bench.json", "x", also=folder / "also.md")
+    assert "\n\nSlides by a mile.\n\n## Limits\n" in text
+    with pytest.raises(ValueError, match="no file"):
+        model_card(folder, folder / "bench.json", "x", also=folder / "absent.md")
     changed = results | {"klt": results["static"]}
     save_results(folder / "bench.json", changed)
     assert model_card(folder, folder / "bench.json", "two cores of a toaster") != text

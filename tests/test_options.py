@@ -211,7 +211,7 @@ def lines(sample, folder):
         [*train, *flags(recipe), "--tracker", "neighbors", 4],
         [*train, "--resume"],
         ["card", run, results, "--hardware", "a core", "--out", folder / "CARD.md", "--name", "mine",
-         "--weights", run / "weights.safetensors", "--command", "train"],
+         "--weights", run / "weights.safetensors", "--command", "train", "--also", Path(__file__).parents[1] / "README.md"],
         ["curves", run, run / "log.jsonl", "--out", folder / "curves.png", "--by", "minutes"],
     ]  # fmt: skip
 

@@ -26,16 +26,20 @@ def model_card(
     name: str = "lite",
     command: str | None = None,
     weights: str | Path | None = None,
+    also: str | Path | None = None,
 ) -> str:
     """The model card of a finished training, in Markdown; ValueError where a file is missing, unreadable or empty.
 
     `folder` holds `config.json`, `log.jsonl` and the weights, unless these lie elsewhere (`weights`); `results` is what
-    `benchmark --out` wrote. Files cannot know the `hardware`, nor a `command` that is to be shown beside the recipe.
+    `benchmark --out` wrote, `also` a Markdown file to put before the limits. Files cannot know the `hardware`, nor a
+    `command` that is to be shown beside the recipe.
     """
     folder = Path(folder)
     path = Path(weights) if weights else folder / "weights.safetensors"
     if not (folder / "config.json").exists() or not path.exists():
         raise ValueError(f"card: {folder} is not a finished training; it needs config.json, log.jsonl and {path.name}")
+    if also and not Path(also).is_file():
+        raise ValueError(f"card: no file {also}; --also takes Markdown, such as tests.robustness writes")
     config = TrainConfig.from_dict(json.loads((folder / "config.json").read_text(encoding="utf-8")))
     log, (scores, _) = read_log(folder), load_results(results)
     if not log or not scores:
@@ -55,6 +59,7 @@ def model_card(
         "## Scores\n\nMeans with 95 % bootstrap intervals over clips of the Lite benchmark, whose seeds no training can draw.",
         *(f"{title}:\n\n{summary_table(scores, [m + part for m in METRICS])}" for title, part in _PARTS.items()),
         *_differences(scores, compared, name),
+        *([Path(also).read_text(encoding="utf-8").strip()] if also else []),
     ]
     model = config.tracker_config()
     size = "x".join(map(str, model.image_size))
