@@ -1,8 +1,8 @@
 """What happens to a tracker outside the benchmark's clean clips: `python -m tests.robustness --tracker lite static klt`.
 
-A picture that slides at a constant speed; wrong poses, poor depth, soft and grey images, frozen depth and other image
-sizes on clips of `moving-camera`, each against the same clips as they are, paired; the share of hidden frames called
-visible. Results go to a JSON file, which an interrupted run continues, a Markdown page (for `card --also`) and a figure.
+A picture that slides at a constant speed; wrong poses, poor depth, soft and grey images and frozen depth on clips of
+`moving-camera`, each against the same clips as they are, paired; the share of hidden frames called visible; what other
+image sizes, fewer updates and bfloat16 cost and save. Results go to a JSON file, which an interrupted run continues, a Markdown page (for `card --also`) and a figure.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 import cv2
 import matplotlib
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
@@ -33,7 +34,15 @@ from tapip3d_lite.geometry import unproject
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade, wrong_poses
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)  # pixels a frame, of 128
-SIZES = ((96, 96), (128, 128), (192, 192), (256, 256))
+RUNS: dict[str, dict] = {
+    "as it is": {},
+    "two updates": {"iterations": 2},
+    "four updates": {"iterations": 4},
+    "bfloat16": {"autocast": True},
+    "two updates, bfloat16": {"iterations": 2, "autocast": True},
+    "one way": {"bidirectional": False},
+    **{f"{side}x{side} pixels": {"size": (side, side)} for side in (96, 192, 256)},
+}
 DISTANCE, FOCAL, SIDE = 5.0, 128.0, 128
 METRICS = ("AJ3D_none", "APD3D_none", "AJ3D_none_dynamic", "APD3D_none_dynamic", "OA")
 
@@ -114,9 +123,10 @@ def falsely_visible(pred: t3d.Tracks, clip: Clip) -> dict[str, float]:
     }
 
 
-def scored(tracker: object, clip: Clip, **options: object) -> dict[str, float]:
+def scored(tracker: object, clip: Clip, autocast: bool = False, **options: object) -> dict[str, float]:
     start = time.process_time()
-    pred = tracker.track(clip, **options)
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        pred = tracker.track(clip, **options)
     seconds = time.process_time() - start
     scores = t3d.evaluate(pred, clip)
     return {name: scores[name] for name in METRICS} | falsely_visible(pred, clip) | {"seconds": seconds}
@@ -130,11 +140,11 @@ def measure(names: list[str], count: int, out: Path) -> dict:
     for index, clip in enumerate(clips):
         for name, change in CONDITIONS.items():
             jobs[f"{name} {index}"] = lambda t, c=clip, f=change, i=index: scored(t, f(c, i))
-        for size in SIZES:
-            jobs[f"size {size[0]} {index}"] = lambda t, c=clip, s=size: scored(t, c, size=s)
+        for name, options in RUNS.items():
+            jobs[f"run {name} {index}"] = lambda t, c=clip, o=options: scored(t, c, **o)
     for name in names:
         tracker, mine = t3d.load_tracker(name), results.setdefault(name, {})
-        todo = [job for job in jobs if job not in mine and (hasattr(tracker, "config") or not job.startswith("size"))]
+        todo = [job for job in jobs if job not in mine and (hasattr(tracker, "config") or not job.startswith("run"))]
         for job in tqdm(todo, desc=name):
             mine[job] = jobs[job](tracker)
             write_text(out, json.dumps(results, indent=1) + "\n")
@@ -168,13 +178,16 @@ def page(results: dict, count: int) -> str:
     shares = ("hidden_visible", "hidden_visible_dynamic")
     rows = [[n, *(show(bootstrap_interval(scores(n, "as it is", m))) for m in shares)] for n in names]
     parts += [markdown_table(["tracker", "all points", "moving points"], rows)]
-    learnt = [name for name in names if f"size {SIZES[0][0]} 0" in results[name]]
-    parts += ["The same clips (128x128) resized; processor seconds a clip, side by side in one run:"]
-    rows = [
-        [n, f"{s[0]}", *(show(bootstrap_interval(scores(n, f"size {s[0]}", m))) for m in METRICS[:2]), f"{np.mean(scores(n, f'size {s[0]}', 'seconds')):.1f}"]
-        for n in learnt for s in SIZES
-    ]  # fmt: skip
-    parts += [markdown_table(["tracker", "size", *METRICS[:2], "seconds"], rows)]
+    parts += [
+        "The same clips (128x128) tracked otherwise; differences and processor seconds a clip, side by side in one run:"
+    ]
+    rows = []
+    for name in (name for name in names if f"run {next(iter(RUNS))} 0" in results[name]):
+        for what in RUNS:
+            pairs = [[scores(name, f"run {x}", m) for x in (what, "as it is")] for m in METRICS[:2]]
+            seconds = np.mean(scores(name, f"run {what}", "seconds"))
+            rows.append([name, what, *(show(paired_difference(*pair), "+") for pair in pairs), f"{seconds:.1f}"])
+    parts += [markdown_table(["tracker", "how", *(f"{m} gained" for m in METRICS[:2]), "seconds"], rows)]
     return "\n\n".join(parts) + "\n"
 
 
