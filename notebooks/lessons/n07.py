@@ -13,6 +13,7 @@ import tapip3d_lite as t3d
 from lessons.checker import check
 from lessons.guesses import reveal
 from lessons.milestone import CLIP, Use, plugged, report
+from lessons.n00 import card
 from lessons.n07_exercises import EXERCISES
 from lessons.n07_figures import (
     balls,
@@ -40,6 +41,7 @@ __all__ = [
     "by_threshold",
     "by_threshold_chart",
     "by_word_chart",
+    "card",
     "check",
     "collect",
     "coverage",

@@ -199,7 +199,7 @@ def worst(p: Array, q: Array, visible: Array, focal: Array, count: int, slip: st
 
 
 def _tracked(rng: np.random.Generator, size: int) -> tuple:
-    """Tracks whose errors differ in size, in length of visibility and with depth; one is never seen."""
+    """Tracks whose errors differ in size, in length of visibility and with depth; one is seen once, one never."""
     frames, tracks = size + 4, 5 * size + 4
     p = rng.normal(size=(frames, tracks, 3)) * 0.3 + np.stack([*np.zeros((2, tracks)), rng.uniform(1.5, 9, tracks)], -1)
     p[..., 2] = np.maximum(p[..., 2], 0.8)
@@ -210,7 +210,11 @@ def _tracked(rng: np.random.Generator, size: int) -> tuple:
     visible[0] = True
     visible[:, tracks // 2] = False
     q[:, tracks // 2] += 4
-    return p, q, visible, rng.uniform(80, 240, frames), min(3 + size, tracks - 1)
+    focal = rng.uniform(80, 240, frames)
+    visible[1:, 0] = False  # seen once, and far off; the next one nearly as far, all the time
+    for n, pixels in ((0, 900), (1, 700)):
+        q[:, n] = p[:, n] + [[pixels, 0, 0]] * (p[:, n, 2] / focal)[:, None]
+    return p, q, visible, focal, min(3 + size, tracks - 1)
 
 
 _WORST_HINTS = {

@@ -150,7 +150,9 @@ def coverage_chart(held: Mapping[str, Mapping[str, float]]) -> Figure:
     for i, (name, shares) in enumerate(held.items()):
         at = np.arange(len(shares)) + (i - (len(held) - 1) / 2) * step
         look = {"color": ("#56b4e9", "#0072b2", "#cc79a7")[i % 3], "hatch": ("", "//", "..")[i % 3], "ec": "white"}
-        ax.bar_label(ax.bar(at, list(shares.values()), step * 0.92, label=name, **look), fmt="{:.0%}", fontsize=9)
+        ax.bar_label(
+            ax.bar(at, list(shares.values()), step * 0.92, label=name, **look), fmt="{:.0%}", fontsize=9, bbox=_PAPER
+        )
     ax.axhline(0.95, color=INK, ls="--", lw=1)
     ax.set_xticks(range(len(shares)), [f"{unit} taken for\nindependent" for unit in shares])
     label_axes(ax, "share of intervals\nthat hold the truth", "")
