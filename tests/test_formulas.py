@@ -12,6 +12,7 @@ import torch
 import tapip3d_lite as t3d
 from lessons.backward_ways import saving_backward
 from lessons.formulas import Formula, Symbol, find_function, formula_table, formulas, main
+from tapip3d_lite.evaluation.intervals import bootstrap_interval
 from tapip3d_lite.geometry import transform
 from tapip3d_lite.model.frames import Frames, frames_from_clip
 from tapip3d_lite.recorder import Recorder
@@ -66,6 +67,7 @@ def run_everything():
     with Recorder(tracker, range(23)):
         tracker.track(clip, queries.numpy(), support_grid=0)
     t3d.evaluate(t3d.load_tracker("static").track(clip), clip)
+    bootstrap_interval([0.1, 0.2])
 
 
 def dimensions():

@@ -7,6 +7,7 @@ import html
 import io
 import re
 
+import numpy as np
 from IPython.display import display
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
@@ -30,8 +31,9 @@ _PARTS = {
     "token, updater\nM times": ("05", 6, 0.5),
     "tracks\nxyz, visible": ("00", 7, 0.5),
     "loss, training": ("06", 7, 1.5),
+    "scores\nAJ, APD, OA": ("07", 7, -0.6),
 }
-_ARROWS = [(0, 1), (0, 2), (2, 3), (1, 4), (3, 4), (4, 5), (5, 6), (6, 7), (7, 8), (8, 9)]
+_ARROWS = [(0, 1), (0, 2), (2, 3), (1, 4), (3, 4), (4, 5), (5, 6), (6, 7), (7, 8), (8, 9), (8, 10)]
 
 
 class Shown:
@@ -73,17 +75,18 @@ def image(figure: Figure, alt: str) -> str:
 
 
 def pipeline(lesson: str) -> Shown:
-    """The method as a map, from RGB-D frames to tracks, with the part of a lesson (`"00"` to `"06"`) lit."""
+    """The method as a map, from RGB-D frames to tracks, with the part of a lesson (`"00"` to `"07"`) lit."""
     names = list(_PARTS)
-    figure = Figure(figsize=(10.2, 1.9), layout="constrained")
+    figure = Figure(figsize=(10.2, 2.3), layout="constrained")
     ax = figure.subplots()
-    ax.set(xlim=(-0.55, 7.55), ylim=(-0.5, 1.85))
+    ax.set(xlim=(-0.55, 7.55), ylim=(-0.95, 1.85))
     ax.axis("off")
     line = {"arrowstyle": "-|>", "mutation_scale": 9, "color": "#8a919c", "shrinkA": 0, "shrinkB": 0}
     for a, b in _ARROWS:
         (_, x0, y0), (_, x1, y1) = _PARTS[names[a]], _PARTS[names[b]]
-        upward = x0 == x1
-        start, end = ((x0, y0 + 0.24), (x1, y1 - 0.24)) if upward else ((x0 + 0.44, y0), (x1 - 0.44, y1))
+        way = 0.24 * np.sign(y1 - y0)
+        beside = x0 - 0.2 * (way < 0)  # of the number below a part
+        start, end = ((beside, y0 + way), (beside, y1 - way)) if x0 == x1 else ((x0 + 0.44, y0), (x1 - 0.44, y1))
         ax.add_patch(FancyArrowPatch(start, end, **line))
     ax.add_patch(FancyArrowPatch((6, 0.76), (4, 0.76), connectionstyle="arc3,rad=0.3", **line))
     ax.text(5, 1.42, "with the new estimate", ha="center", fontsize=8, color="#57606a")
@@ -94,8 +97,8 @@ def pipeline(lesson: str) -> Shown:
                                     fc=_LIT if on else _PALE, ec=_INK, lw=1.6 if on else 0.6, zorder=2))  # fmt: skip
         ax.text(x, y, name, ha="center", va="center", fontsize=8.5, color=_INK, zorder=3)
         ax.text(
-            x + 0.4 if y > 1.2 else x,
-            y - 0.38,
+            x if 0 <= y < 1.2 else x + 0.4,
+            y - 0.38 if y >= 0 else y + 0.36,
             number,
             ha="center",
             va="center",
@@ -109,7 +112,9 @@ def pipeline(lesson: str) -> Shown:
     alt = (
         "The method from left to right: frames with depth and cameras; encoder and lifting side by side; world space; "
     )
-    alt += "feature cloud; neighbours; attention between neighbourhoods; updater, which loops back; tracks; loss. "
+    alt += (
+        "feature cloud; neighbours; attention between neighbourhoods; updater, which loops back; tracks; loss; scores. "
+    )
     return show(figure, f"{alt}Lit: {words}.", f"Where we are: {words}. The small numbers are the lessons.")
 
 
