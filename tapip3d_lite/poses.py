@@ -17,7 +17,7 @@ from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import invert, transform
 
 _ENOUGH = 12  # matches that must agree on a pose
-_STILL = 0.3  # share of matches that must rest
+_STILL = 0.4  # share of matches that must rest
 _SLACK = 1.5  # a simpler correction may leave this much more of what rests, in squares
 
 
