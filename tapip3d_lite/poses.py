@@ -30,8 +30,8 @@ def estimate_poses(clip: Clip) -> Clip:
     the cube of their number, so cut a clip of 1,000.
 
     Raises:
-        ValueError: some frames have too few corners that agree (blank or dark images, no depth, another scene, nothing
-            at rest); they are named.
+        ValueError: some frames, which are named, have too few corners that agree: blank or dark images, no depth,
+            another scene, too little at rest.
     """
     if len(clip) == 1:
         return clip
@@ -50,8 +50,9 @@ def estimate_poses(clip: Clip) -> Clip:
         best, _ = _simplest(pairs, views, start, best, POSES)
     if (lost := np.flatnonzero(agreed < _ENOUGH)).size:
         raise ValueError(
-            f"estimate_poses: clip {clip.name!r}, frames {', '.join(map(str, lost))}: fewer than {_ENOUGH} corners with depth "
-            "agree on the camera's motion; leave these frames out, or take poses from another tool"
+            f"estimate_poses: clip {clip.name!r}, frames {', '.join(map(str, lost))}: too few corners with depth agree on the "
+            f"camera's motion (at least {_ENOUGH}, and {_STILL:.0%} of them, must); leave these frames out, or take poses from "
+            "another tool"
         )
     poses = _in_units(best.poses, views.unit)
     return _corrected(clip, poses @ invert(poses[0]) @ given[0], best.scale - np.median(best.scale))
@@ -154,7 +155,7 @@ def _simplest(pairs: Sequence[Pair], views: Views, start: np.ndarray, both: Fit,
 
 
 def _agreed(pairs: Sequence[Pair], best: Fit) -> np.ndarray:
-    """How many matches of each frame (T,) belong to the world at rest; 0 where most do not."""
+    """How many matches of each frame (T,) belong to the world at rest; 0 where too many do not."""
     frames = np.concatenate([np.full((len(pair.z), 2), (pair.a, pair.b)) for pair in pairs])
     every, rests = (np.bincount(x.ravel(), minlength=len(best.poses)) for x in (frames, frames[best.rests()]))
     return np.where(rests < _STILL * every, 0, rests)
