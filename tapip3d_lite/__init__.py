@@ -14,6 +14,7 @@ _HOMES = {
     "clip": ["Clip", "Tracks", "check_queries", "load_clip", "load_tracks"],
     "queries": ["grid_queries", "queries_from_pixels", "resolve_queries"],
     "check": ["check_clip"],
+    "poses": ["carry", "estimate_poses", "steady_clip"],
     "simulate": ["SimulationConfig", "simulate_clip"],
     "evaluation.metrics": ["tapvid2d_metrics", "tapvid3d_metrics"],
     "evaluation.evaluate": ["evaluate"],

@@ -76,6 +76,15 @@ CONDITIONS: dict[str, Callable[[Clip, int], Clip]] = {
 }
 
 
+def steadied(change: Callable[[Clip, int], Clip]) -> Callable[[Clip, int], Clip]:
+    # Its own truth will do: scores are in camera coordinates, where steadying leaves it.
+    return lambda clip, seed: t3d.steady_clip(change(clip, seed))
+
+
+JITTER = ("as it is", "poses", "depth scale")
+CONDITIONS |= {f"{name}, steadied": steadied(CONDITIONS[name]) for name in CONDITIONS if name.startswith(JITTER)}
+
+
 def sliding_picture(speed: float, seed: int, frames: int) -> tuple[Clip, np.ndarray]:
     """A random picture on a wall that slides at `speed` pixels a frame; the clip with 36 queries, and its step (2,) in metres."""
     rng = np.random.default_rng(seed)

@@ -19,7 +19,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # later one of a floor's list uses the earlier ones.
 FLOORS = [
     ["geometry", "files", "validate"],
-    ["clip", "queries"],
+    ["clip", "queries", "bundle", "poses"],
     ["check", "simulate", "model"],
     ["variants", "speed"],
     ["checkpoint_reader", "official", "recorder"],

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.geometry import invert, transform
+from tapip3d_lite.geometry import invert
+from tapip3d_lite.poses import move
 from tapip3d_lite.validate import check_range
 
 _EDGE = 0.08  # neighbouring depths that differ by this share belong to two surfaces
@@ -132,19 +133,6 @@ def pose_error(rng: np.random.Generator, frames: int, degrees: float, drift: flo
     error[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in turns + wander[:, :3]]
     error[:, :3, 3] = wander[:, 3:]
     return error
-
-
-def move(clip: Clip, motion: np.ndarray) -> Clip:
-    """Express a clip with tracks in other coordinates, by a rigid motion (T, 4, 4) float64.
-
-    A point at x in frame t is then at motion[t] x, and projects to the same pixel as before.
-    """
-    extrinsics = clip.extrinsics.astype(np.float64) @ invert(motion)
-    at = motion[clip.queries[:, 0].astype(int)]
-    places = transform(clip.queries[:, None, 1:].astype(np.float64), at)[:, 0]
-    queries = np.concatenate([clip.queries[:, :1], places], -1)
-    tracks = replace(clip.tracks, xyz=transform(clip.tracks.xyz.astype(np.float64), motion), queries=queries)
-    return replace(clip, extrinsics=extrinsics, tracks=tracks, queries=queries)
 
 
 def _each(change: object, depths: np.ndarray) -> np.ndarray:

@@ -15,7 +15,8 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert
-from tapip3d_lite.simulate.degrade import log_uniform, move, pose_error
+from tapip3d_lite.poses import move
+from tapip3d_lite.simulate.degrade import log_uniform, pose_error
 from tapip3d_lite.validate import check_range
 
 
