@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -40,13 +41,16 @@ def track(
     crop: Annotated[
         tuple[int, int, int, int] | None, arg(help="left, top, right, bottom to look at, in pixels")
     ] = None,
+    steady: Annotated[bool, arg(help="first correct poses and depth scales that jitter")] = False,
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
 ) -> None:
     """Track the points of a clip (npz) in 3D."""
     loaded = t3d.load_clip(clip)
     queries = loaded.queries if own_queries and loaded.queries is not None else t3d.grid_queries(loaded, grid)
-    options = {"queries": queries, "space": space, "size": size, "crop": crop}
-    result = t3d.load_tracker(tracker, device=device).track(loaded, **options)
+    given = replace(loaded, queries=queries)
+    seen = t3d.steady_clip(given) if steady else given
+    result = t3d.load_tracker(tracker, device=device).track(seen, space=space, size=size, crop=crop)
+    result = result if seen is given else t3d.carry(result, seen, given)
     shown = result.visible.mean() if result.visible.size else 0.0
     print(f"{clip}: {len(queries)} points over {len(loaded)} frames with {tracker}, {shown:.0%} visible")
     if loaded.tracks is not None and own_queries:

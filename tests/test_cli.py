@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
+from tapip3d_lite.simulate.degrade import wrong_poses
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -48,6 +49,16 @@ def test_track_on_a_grid(clip_file):
     result = call("track", clip_file, "--tracker", "static", "--no-own-queries", "--grid", "5")
     assert result.returncode == 0, result.stderr
     assert "25 points" in result.stdout and "AJ3D" not in result.stdout
+
+
+def test_a_steady_clip_is_tracked_better(tmp_path):
+    path, scores = tmp_path / "jitters.npz", []
+    wrong_poses(t3d.load_clip(ROOT / "data_samples" / "handheld.npz"), 1.0, seed=0, drift=0).save(path)
+    for flags in ([], ["--steady"]):
+        result = call("track", path, "--tracker", "static", "--out", tmp_path / "out.npz", *flags)
+        assert result.returncode == 0, result.stderr
+        scores.append(t3d.evaluate(t3d.load_tracks(tmp_path / "out.npz"), t3d.load_clip(path))["AJ3D_none"])
+    assert scores[1] > scores[0] + 0.1
 
 
 def test_evaluate_prints_a_table_with_means(clip_file):

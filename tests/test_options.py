@@ -205,7 +205,7 @@ def lines(sample, folder):
         ["check", sample],
         ["track", sample, "--tracker", "lite", "--out", folder / "out.npz", "--html", folder / "out.html",
          "--png", folder / "out.png", "--space", "camera", "--device", "cpu"],
-        ["track", sample, "--grid", 3, "--no-own-queries", "--size", 96, 96, "--crop", 0, 8, 120, 128],
+        ["track", sample, "--grid", 3, "--no-own-queries", "--size", 96, 96, "--crop", 0, 8, 120, 128, "--steady"],
         ["evaluate", sample, "--tracker", "lite", "static", "--device", "cpu"],
         ["benchmark", "--tracker", "lite", "--split", "occlusion", "--space", "camera", "--count", 1, "--out", results,
          "--figure", folder / "scores.png", "--device", "cpu"],
