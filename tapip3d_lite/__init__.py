@@ -11,7 +11,8 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 _HOMES = {
-    "clip": ["Clip", "Tracks", "check_queries", "load_clip", "load_tracks"],
+    "clip": ["Clip", "Tracks", "check_queries", "load_tracks"],
+    "formats": ["load_clip", "save_clip"],
     "queries": ["grid_queries", "queries_from_pixels", "resolve_queries"],
     "check": ["check_clip"],
     "simulate": ["SimulationConfig", "simulate_clip"],

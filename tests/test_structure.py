@@ -20,6 +20,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = [
     ["geometry", "files", "validate"],
     ["clip", "queries"],
+    ["formats"],
     ["check", "simulate", "model"],
     ["variants", "speed"],
     ["checkpoint_reader", "official", "recorder"],
