@@ -24,33 +24,19 @@ class _Record:
         self.state = state
 
 
-class _Dtype(_Record):
-    """`numpy.dtype(code, align, copy)`."""
-
-
-class _Array(_Record):
-    """`_reconstruct(ndarray, ...)`, with the state (version, shape, dtype, fortran, data)."""
-
-
-class _Scalar(_Record):
-    """`scalar(dtype, data)`."""
-
-
-class _Buffer(_Record):
-    """`_frombuffer(data, dtype, shape, order)`, how protocol 5 writes an array."""
-
-
 class _Bytes:
-    """`_codecs.encode(text, "latin1")`, how protocol 2 writes bytes."""
+    """`_codecs.encode(text, "latin1")` and `bytes()`: how protocols 0 to 2 write bytes."""
 
-    def __new__(cls, text: str, _encoding: str) -> bytes:
+    def __new__(cls, text: str = "", _encoding: str = "") -> bytes:
         return text.encode("latin1")
 
 
+_Dtype, _Array, _Scalar, _Buffer = (type(name, (_Record,), {}) for name in ("_Dtype", "_Array", "_Scalar", "_Buffer"))
 _FOUND = {("numpy", "dtype"): _Dtype, ("numpy", "ndarray"): _Record, ("_codecs", "encode"): _Bytes}
+_FOUND |= {("__builtin__", "bytes"): _Bytes, ("builtins", "bytes"): _Bytes}
 for _core in ("numpy.core", "numpy._core"):
     _FOUND |= {(f"{_core}.multiarray", "_reconstruct"): _Array, (f"{_core}.multiarray", "scalar"): _Scalar}
-    _FOUND[f"{_core}.numeric", "_frombuffer"] = _Buffer
+    _FOUND[f"{_core}.numeric", "_frombuffer"] = _Buffer  # protocol 5
 
 
 class _Machine(pickle.Unpickler):
@@ -69,10 +55,10 @@ def load_objects(path: str | Path, file: BinaryIO) -> Any:
     try:
         major, minor = np.lib.format.read_magic(file)
         shape, fortran, dtype = getattr(np.lib.format, f"read_array_header_{major}_{minor}")(file)
-        if dtype.hasobject:
-            value = _built(_Machine(file).load())
-            return value.item() if isinstance(value, np.ndarray) and value.shape == () else value
-        return _shaped(file.read(), dtype, shape, fortran)
+        if not dtype.hasobject:
+            return _shaped(file.read(), dtype, shape, fortran)
+        value = _built(_Machine(file).load())
+        return value.item() if isinstance(value, np.ndarray) and value.shape == () else value
     except Exception as error:  # a damaged pickle fails in any way
         raise ValueError(f"{path}: not a readable file of arrays ({type(error).__name__}: {error})") from None
 
@@ -81,11 +67,11 @@ def _built(value: Any) -> Any:
     """Records as arrays and scalars, inside containers too."""
     if isinstance(value, _Array):
         _, shape, dtype, fortran, data = value.state
-        if dtype.arguments[0] in ("O", "O8"):
-            array = np.empty(len(data), object)
-            array[:] = [_built(item) for item in data]
-            return array.reshape(shape, order="F" if fortran else "C")
-        return _shaped(data, _dtype(dtype), shape, fortran)
+        if not dtype.arguments[0].startswith("O"):
+            return _shaped(data, _dtype(dtype), shape, fortran)
+        array = np.empty(len(data), object)
+        array[:] = [_built(item) for item in data]
+        return array.reshape(shape, order="F" if fortran else "C")
     if isinstance(value, _Buffer):
         data, dtype, shape, order = value.arguments
         return _shaped(data, _dtype(dtype), shape, order == "F")
@@ -93,10 +79,12 @@ def _built(value: Any) -> Any:
         return _shaped(value.arguments[1], _dtype(value.arguments[0]), (), False)[()]
     if isinstance(value, dict):
         return {key: _built(item) for key, item in value.items()}
+    if isinstance(value, _Record | type):
+        raise pickle.UnpicklingError(f"{value!r} stands where data should")
     return type(value)(map(_built, value)) if isinstance(value, list | tuple) else value
 
 
-def _dtype(record: _Dtype) -> np.dtype:
+def _dtype(record: Any) -> np.dtype:
     code, order = record.arguments[0], record.state[1]
     if not re.fullmatch(r"[biufcSU]\d+", code):
         raise pickle.UnpicklingError(f"an array of dtype {code} is refused")
