@@ -18,6 +18,7 @@ _HOMES = {
     "simulate": ["SimulationConfig", "simulate_clip"],
     "evaluation.metrics": ["tapvid2d_metrics", "tapvid3d_metrics"],
     "evaluation.evaluate": ["evaluate"],
+    "export": ["export_tracks"],
     "trackers": ["list_trackers", "load_tracker"],
     "model.config": ["TrackerConfig"],
     "model.tracker": ["Tracker"],

@@ -26,6 +26,7 @@ FLOORS = [
     ["checkpoint_reader", "official", "recorder"],
     ["training", "evaluation"],
     ["figures"],
+    ["export"],
     ["trackers"],
     ["lab"],
     ["__main__", ""],
