@@ -19,8 +19,8 @@ from tyro.conf import Positional, arg
 import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.benchmark import ALL, METRICS, SPLITS, run_benchmark, summary_table
 from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
-from tapip3d_lite.export import check_suffix
-from tapip3d_lite.files import write_text
+from tapip3d_lite.export import WRITERS
+from tapip3d_lite.files import check_suffix, write_text
 from tapip3d_lite.formats import FORMATS
 from tapip3d_lite.lab.card import model_card
 from tapip3d_lite.simulate import simulate_dataset
@@ -50,8 +50,9 @@ def track(
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
 ) -> None:
     """Track the points of a clip in 3D."""
-    for path in out:
-        check_suffix(path)
+    for path, allowed in (*((path, WRITERS) for path in out), (html, (".html",)), (png, (".png",))):
+        if path:
+            check_suffix(path, *allowed)  # before the work, not after it
     loaded = t3d.load_clip(clip, format)
     queries = loaded.queries if own_queries and loaded.queries is not None else t3d.grid_queries(loaded, grid)
     options = {"queries": queries, "space": space, "size": size, "crop": crop}

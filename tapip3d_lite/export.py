@@ -11,7 +11,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures.flat import check_drawable, track_colors
-from tapip3d_lite.files import atomic_path
+from tapip3d_lite.files import atomic_path, check_suffix
 from tapip3d_lite.geometry import project
 
 _TAIL = 8  # frames
@@ -23,25 +23,15 @@ def export_tracks(tracks: Tracks, path: str | Path, clip: Clip) -> None:
     - `.npz`: the authors' result, with all that their viewer needs.
     - `.csv`: a line for each frame and track: frame, track, x, y, z (world), visible, u, v (pixels; empty behind the camera).
     - `.ply`: points with colours, `frame`, `track` and `visible`, and edges along the tracks (binary; world coordinates).
-    - `.mp4` (MPEG-4), `.gif`: the video with the points, filled where visible, and their tails.
+    - `.mp4` (MPEG-4), `.gif` (256 fixed colours): the video with the points, filled where visible, and their tails.
 
     Raises:
         ValueError: another suffix, tracks of another length than the clip's, or OpenCV cannot write the film.
     """
-    write = _WRITERS[check_suffix(path)]
+    write = WRITERS[check_suffix(path, *WRITERS)]
     check_drawable(clip, tracks)
     with atomic_path(path) as temporary:
         write(tracks, temporary, clip)
-
-
-def check_suffix(path: str | Path) -> str:
-    """The suffix of a path that `export_tracks` can write, or ValueError."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in _WRITERS:
-        raise ValueError(
-            f"{path}: tracks are written as {', '.join(_WRITERS)}, got {suffix or 'no suffix'}; choose one of them"
-        )
-    return suffix
 
 
 def _csv(tracks: Tracks, path: Path, clip: Clip) -> None:
@@ -113,7 +103,7 @@ def _gif(tracks: Tracks, path: Path, clip: Clip) -> None:
         raise ValueError(f"{path}: this OpenCV writes no GIF; choose .mp4")
 
 
-_WRITERS: dict[str, Callable[[Tracks, Path, Clip], None]] = {
+WRITERS: dict[str, Callable[[Tracks, Path, Clip], None]] = {
     ".npz": Tracks.save,
     ".csv": _csv,
     ".ply": _ply,
