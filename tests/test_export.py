@@ -87,7 +87,9 @@ def test_films_show_the_overlay(clip, tmp_path):
     assert np.abs(np.stack(frames).astype(int) - drawn).mean() < 8
     t3d.export_tracks(clip.tracks, tmp_path / "a.gif", clip)
     read, gif = cv2.imreadanimation(str(tmp_path / "a.gif"))
-    assert read and len(gif.frames) == 5 and np.abs(gif.frames[3][..., 2::-1].astype(int) - drawn[3]).mean() < 20  # 256 fixed colours
+    assert (
+        read and len(gif.frames) == 5 and np.abs(gif.frames[3][..., 2::-1].astype(int) - drawn[3]).mean() < 20
+    )  # 256 fixed colours
 
 
 def test_points_far_outside_or_unknown_do_no_harm(clip):

@@ -384,6 +384,18 @@ def test_poses_in_other_forms(clip, tmp_path, columns):
     same_cameras(t3d.load_clip(tmp_path), clip)
 
 
+def test_frames_named_by_their_times_may_be_apart(clip, tmp_path):
+    write_folder(clip, tmp_path)
+    names = ["0.10.png", "0.13.png", "0.19.png", "0.20.png", "0.31.png"]
+    for folder in ("color", "depth"):
+        for i, name in enumerate(names):
+            (tmp_path / folder / f"{10 * i}.png").rename(tmp_path / folder / name)
+    np.testing.assert_array_equal(t3d.load_clip(tmp_path).video, clip.video)
+    for i, name in enumerate(names):
+        (tmp_path / "color" / name).rename(tmp_path / "color" / f"{1305031102000000 + 7 * i * i}.png")
+    np.testing.assert_array_equal(t3d.load_clip(tmp_path).video, clip.video)
+
+
 def test_save_clip_writes_a_folder_that_loads_to_the_bit(clip, tmp_path):
     moving = clip.intrinsics.copy()
     moving[:, 0, 0] *= np.linspace(1, 1.1, FRAMES)
@@ -608,6 +620,18 @@ def bad_gap(path):
     return r"color: a gap after 10.png"
 
 
+def bad_gap_beside_another_number(path):
+    for image in (path / "color").iterdir():
+        image.rename(image.with_name(f"cam2_{image.name}"))
+    (path / "color" / "cam2_30.png").unlink()
+    return r"color: a gap after cam2_20.png"
+
+
+def bad_pose_lost(path):
+    text(path / "poses.txt", [np.eye(4), np.full(16, -np.inf), np.eye(4), np.zeros(16), np.eye(4)])
+    return r"the poses of frames \[1, 3\] are none \(tracking was lost"
+
+
 def bad_focal(path):
     text(path / "intrinsics.txt", [[0, 50, 30, 20]])
     return "intrinsics: focal lengths must be positive, got fx, fy = 0, 50"
@@ -719,6 +743,7 @@ def test_bad_files_are_named(clip, tmp_path):
         ("", {"depth": tmp_path / "d.npy"}, "d.npy: not a readable file of depth"),
         ("", {"depth": tmp_path / "flat.npy"}, r"flat.npy: expected depth \(T, H, W\)"),
         ("", {"frames": slice(99, None)}, "colour images of sizes none"),
+        ("", {"frames": slice(-3, None)}, "without negative numbers"),
         ("absent", {}, "no such file"),
     ]:
         with pytest.raises(ValueError, match=message):

@@ -48,6 +48,8 @@ def load_clip(
     path = Path(path)
     if format not in FORMATS:
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, got {format!r}")
+    if any((x or 0) < 0 for x in (frames.start, frames.stop, frames.step)):
+        raise ValueError(f"frames: expected a slice without negative numbers, got {frames}; count from the first frame")
     if not path.exists():
         raise ValueError(f"{path}: no such file; check the path")
     kind = _recognised(path) if format == "auto" else format

@@ -39,8 +39,9 @@ def megasam(path: Path, _points: bool) -> Clip:
     """MegaSaM: `images`, `depths`, one `intrinsic` (3, 3), `cam_c2w` (T, 4, 4) camera to world."""
     arrays = load_npz(path)
     require(path, arrays, "MegaSaM's output", ("images", "depths", "intrinsic", "cam_c2w"), "take its *_sgd_cvd_hr.npz")
-    poses, k = invert(arrays["cam_c2w"].astype(np.float64)), matrix(arrays["intrinsic"], f"{path}: intrinsic")
-    return Clip(_video(arrays["images"]), arrays["depths"], np.tile(k, (len(poses), 1, 1)), poses, name=path.stem)
+    poses = invert(arrays["cam_c2w"].astype(np.float64))
+    intrinsics = np.broadcast_to(arrays["intrinsic"], (len(poses), 3, 3))
+    return Clip(_video(arrays["images"]), arrays["depths"], intrinsics, poses, name=path.stem)
 
 
 def vggt(path: Path, _points: bool) -> Clip:
@@ -125,6 +126,8 @@ def read_depths(path: str | Path) -> np.ndarray:
 
 
 def _video(images: np.ndarray) -> np.ndarray:
-    """(T, H, W, 3) uint8 of images with colours first or last, as bytes or in [0, 1]."""
+    """(T, H, W, 3) uint8 of images with colours first or last, up to 255 or up to 1."""
     images = np.moveaxis(images, 1, -1) if images.ndim == 4 and images.shape[1] == 3 != images.shape[-1] else images
-    return np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8) if images.dtype.kind == "f" else images
+    if images.dtype.kind == "f":
+        images = np.rint(np.clip(images * (255 if images.max() <= 1 else 1), 0, 255)).astype(np.uint8)
+    return np.ascontiguousarray(images)

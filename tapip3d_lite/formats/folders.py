@@ -97,18 +97,25 @@ def load_parts(parts: Parts, frames: slice, name: str, depths: np.ndarray | None
     Raises:
         ValueError: counts that differ, unreadable or unfit images, unknown intrinsics.
     """
-    s, count = parts.settings, len(parts.poses)
+    s, count, given = parts.settings, len(parts.poses), len(parts.depth if depths is None else depths)
     if isinstance(parts.color, Path):
         video, colors, fps = read_video(parts.color, frames)
         s = replace(s, fps=fps if 0 < fps < np.inf else s.fps)
     else:
-        video, colors = _images(parts.color[frames], parts.folder), len(parts.color)
-    if {colors, count, len(parts.depth) if depths is None else len(depths)} != {count}:
+        colors = len(parts.color)
+    if not colors == given == count:
         raise ValueError(
-            f"{parts.folder}: {colors} colour frames, {len(parts.depth) if depths is None else len(depths)} of depth and "
-            f"{count} poses; each frame needs one of each: remove what has no partner"
+            f"{parts.folder}: {colors} colour frames, {given} of depth and {count} poses; each frame needs one of each: "
+            "remove what has no partner"
         )
+    video = video if isinstance(parts.color, Path) else _images(parts.color[frames], parts.folder)
     size, poses = video.shape[1:3], np.asarray(parts.poses, np.float64)[frames]
+    lengths = np.linalg.norm(poses[:, :3, :3], axis=(1, 2))  # of a rotation: sqrt(3)
+    lost = np.flatnonzero(~((lengths > 0.1) & np.isfinite(poses).all((1, 2))))
+    if len(lost):
+        raise ValueError(
+            f"{parts.folder}: the poses of frames {lost[:5].tolist()} are none (tracking was lost?); leave them out"
+        )
     intrinsics = _intrinsics(parts, size)[frames]
     extrinsics = np.linalg.inv(poses) if s.poses == "camera_to_world" else poses
     extrinsics = _FLIP @ extrinsics if s.axes == "opengl" else extrinsics
@@ -228,9 +235,11 @@ def numbered(folder: Path, suffixes: Sequence[str], pattern: str = "") -> list[P
     found = [x for x in folder.iterdir() if x.suffix.lower() in suffixes and re.search(pattern, x.name)]
     numbers = {x: [int(n) for n in re.findall(r"\d+", x.stem)] for x in found}
     found.sort(key=lambda x: (numbers[x], x.name))
-    counts = [numbers[x][0] for x in found if len(numbers[x]) == 1]
-    if len(counts) == len(found) > 2 and counts[-1] < 1e8:  # larger ones are times
-        steps = np.diff(counts)
+    rows = np.array([numbers[x] for x in found]) if len({len(n) for n in numbers.values()}) == 1 else np.zeros((0, 1))
+    counting = rows[:, np.ptp(rows, axis=0) > 0] if len(rows) else rows
+    # One number counts; large ones and those with a point are times.
+    if counting.shape[1] == 1 and rows.max(initial=0) < 1e8 and not any(re.search(r"\d\.\d", x.stem) for x in found):
+        steps = np.diff(counting[:, 0])
         if (steps != steps.min()).any():
             gap = found[int(np.argmax(steps != steps.min()))].name
             raise ValueError(

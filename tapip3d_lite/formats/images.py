@@ -80,7 +80,7 @@ def read_depth(path: Path, scale: float = 1000.0, no_depth: float = 65535) -> np
         )
     if depth.dtype.kind in "iu":
         return np.where(depth == no_depth, 0, depth).astype(np.float32) / np.float32(scale)
-    return depth.astype(np.float32)
+    return np.where(depth < 1e6, depth, 0).astype(np.float32)  # renderers write 1e10 for nothing
 
 
 def fit_depth(depth: np.ndarray, size: tuple[int, int], name: object) -> np.ndarray:

@@ -103,7 +103,7 @@ def record3d(folder: Path) -> Parts:
     meta = read_json(path)
     missing = [key for key in ("K", "poses", "w", "h") if key not in meta]
     if missing:
-        raise ValueError(f"{path}: {', '.join(missing)} missing; export the recording again")
+        raise ValueError(f"{path}: {', '.join(missing)} missing; export again, or force another format")
     one = folder / "rgbd"
     homes = (one, one) if one.is_dir() else (folder / "rgb", folder / "depth")
     color = numbered(homes[0], (".jpg", ".jpeg") if one.is_dir() else PICTURES)
