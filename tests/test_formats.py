@@ -14,6 +14,7 @@ import pytest
 
 import tapip3d_lite as t3d
 from tapip3d_lite.formats import FORMATS
+from tapip3d_lite.formats.arrays import _sparse
 from tapip3d_lite.formats.images import decode_exr, register_depth
 from tapip3d_lite.formats.unpickle import load_objects
 from tapip3d_lite.geometry import invert, point_map, project, resize_intrinsics, transform
@@ -27,7 +28,9 @@ QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95]
 def clip():
     clip = t3d.simulate_clip(seed=4, frames=FRAMES, size=(48, 64), camera="handheld", handheld=4.0, tracks=16)
     assert np.ptp(clip.extrinsics, axis=0).max() > 0.02
-    return clip
+    depths = clip.depths.copy()
+    depths[:, 5:8, 9:13] = 0
+    return replace(clip, depths=depths)
 
 
 def quaternion(rotation):
@@ -120,7 +123,7 @@ def write_depth_anything(clip, folder):
 
 
 def write_tum(clip, folder):
-    """Colour at 0, 1/30, ... s, depth 6 ms later, poses at the colour's times with signs that alternate."""
+    """Colour at 0, 1/30, ... s, depth 6 ms later, poses at the colour's times with changing signs."""
     lists = {"rgb": ["# colour"], "depth": ["# depth"], "groundtruth": ["# timestamp tx ty tz qx qy qz qw"]}
     for i, (image, depth, pose) in enumerate(zip(clip.video, clip.depths, poses(clip), strict=True)):
         time = 1305031102.5 + i / 30
@@ -128,7 +131,7 @@ def write_tum(clip, folder):
         put(folder / "depth" / f"{time + 0.006:.6f}.png", whole(depth, 5000))
         lists["rgb"].append(f"{time:.6f} rgb/{time:.6f}.png")
         lists["depth"].append(f"{time + 0.006:.6f} depth/{time + 0.006:.6f}.png")
-        numbers = [*pose[:3, 3], *(quaternion(pose[:3, :3]) * (-1) ** i)]
+        numbers = [*pose[:3, 3], *(quaternion(pose[:3, :3]) * (-1) ** (i // 2))]
         lists["groundtruth"].append(f"{time:.6f} " + " ".join(repr(float(x)) for x in numbers))
     for name, lines in lists.items():
         (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
@@ -300,12 +303,20 @@ def test_tapvid3d_without_poses_and_with_sparse_depth(clip, tmp_path):
     np.testing.assert_allclose(still.tracks.xyz, arrays["tracks_XYZ"], atol=1e-6)
 
 
+def test_sparse_depth_is_that_of_the_nearest_point():
+    xyz = np.array([[[0, 0, 3.0], [0, 0, 2.0], [0, 0, 1.0], [0, 0, 4.0], [1, 0, 5.0]]])
+    k = np.array([[[10, 0, 3], [0, 10, 2], [0, 0, 1.0]]])
+    depth = _sparse(xyz, np.array([[True, True, False, True, True]]), k, (5, 7))
+    assert depth[0, 2, 3] == 2 and depth[0, 2, 5] == 5 and (depth > 0).sum() == 2
+
+
 def test_depth_anything_and_batches(clip, tmp_path):
     read = t3d.load_clip(write_depth_anything(clip, tmp_path))
     np.testing.assert_array_equal(read.depths, clip.depths)
     np.testing.assert_array_equal(read.video, clip.video)
     with np.load(write_vggt(clip, tmp_path)) as data:
-        np.savez(tmp_path / "batch.npz", **{key: data[key][None] for key in data.files})
+        arrays = {key: data[key][None] for key in data.files}
+    np.savez(tmp_path / "batch.npz", **(arrays | {"images": arrays["images"] - 1e-4}))
     batch = t3d.load_clip(tmp_path / "batch.npz")
     np.testing.assert_array_equal(batch.video, clip.video)
     np.testing.assert_array_equal(batch.extrinsics, clip.extrinsics)
@@ -363,7 +374,7 @@ def test_the_settings_say_what_is_otherwise(clip, tmp_path):
     (tmp_path / "clip.json").write_text(json.dumps(settings | {"depth_scale": 500, "depth_is": "ray"}))
     read = t3d.load_clip(tmp_path)
     same_cameras(read, clip)
-    expected = whole(clip.depths, 1000) / 500 * clip.depths / rays(clip)
+    expected = whole(clip.depths, 1000) / 500 * clip.depths / np.maximum(rays(clip), 1e-9)
     np.testing.assert_allclose(read.depths, expected, rtol=1e-5)
     assert read.fps == 5
 
