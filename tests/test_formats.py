@@ -44,7 +44,8 @@ def quaternion(rotation):
             [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], np.trace(r)],
         ]
     )
-    return np.linalg.eigh(m, UPLO="L")[1][:, -1]
+    q = np.linalg.eigh(m, UPLO="L")[1][:, -1]
+    return q * np.sign(q[3])
 
 
 def poses(clip, opengl=False):
@@ -785,6 +786,8 @@ def test_tum_poses_between_stamps_are_interpolated(clip, tmp_path):
     (tmp_path / "groundtruth.txt").write_text("\n".join(x for i, x in enumerate(lines) if i != 3))
     read, c2w = t3d.load_clip(tmp_path), poses(clip)
     np.testing.assert_allclose(invert(read.extrinsics)[2, :3, 3], (c2w[1] + c2w[3])[:3, 3] / 2, atol=1e-5)
+    between = (clip.extrinsics[1] + clip.extrinsics[3])[:3, :3] / 2
+    np.testing.assert_allclose(read.extrinsics[2, :3, :3], between, atol=0.01)
     same = [0, 1, 3, 4]
     np.testing.assert_allclose(read.extrinsics[same], clip.extrinsics[same], atol=1e-5)
     assert read.fps == pytest.approx(30, rel=1e-3)
