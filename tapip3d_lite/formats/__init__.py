@@ -53,11 +53,16 @@ def load_clip(
     if not path.exists():
         raise ValueError(f"{path}: no such file; check the path")
     kind = _recognised(path) if format == "auto" else format
+    if (kind in _FOLDERS) != path.is_dir() and path.suffix.lower() not in VIDEOS:
+        raise ValueError(
+            f"{path}: format {kind} is that of a {'folder' if kind in _FOLDERS else 'file'}; give it, or another"
+        )
     try:
         if kind in _FOLDERS:
             find = partial(plain_folder, needs_depth=depth is None) if kind == "folder" else _FOLDERS[kind]
-            own = None if depth is None else read_depths(depth)
-            return load_parts(find(path), frames, path.resolve().stem, own)
+            parts, own = find(path), None if depth is None else read_depths(depth)
+            parts.tracks = parts.tracks if points else None
+            return load_parts(parts, frames, path.resolve().stem, own)
         if frames != slice(None):
             raise ValueError(
                 "frames are chosen in folders and videos; cut this clip after loading: clip.cut(start, stop)"

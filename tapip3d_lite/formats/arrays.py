@@ -28,11 +28,10 @@ def npz_keys(path: Path) -> set[str]:
 def result(path: Path, points: bool) -> Clip:
     """The authors' result: the clip in it with its queries (`load_tracks` reads the tracks)."""
     arrays = load_npz(path)
-    require(
-        path, arrays, "a result with its clip", ("video", "depths", "intrinsics", "extrinsics"), "give save the clip"
-    )
-    cameras = [arrays[key] for key in ("depths", "intrinsics", "extrinsics")]
-    return Clip(_video(arrays["video"]), *cameras, arrays.get("query_points") if points else None, name=path.stem)
+    keys = ("video", "depths", "intrinsics", "extrinsics")
+    require(path, arrays, "a result with its clip", keys, "give `save` the clip")
+    video, *cameras = (arrays[key] for key in keys)
+    return Clip(_video(video), *cameras, arrays.get("query_points") if points else None, name=path.stem)
 
 
 def megasam(path: Path, _points: bool) -> Clip:
@@ -58,10 +57,8 @@ def vggt(path: Path, _points: bool) -> Clip:
 
 def tapvid3d(path: Path, points: bool, depth: str | Path | None = None) -> Clip:
     """TAPVid-3D: JPEG images, tracks in each frame's camera, one camera matrix, poses or none; depth comes from elsewhere."""
-    arrays = load_npz(path, skip=(_JPEG,))
-    require(
-        path, arrays, "TAPVid-3D", ("tracks_XYZ", "visibility", "queries_xyt", "fx_fy_cx_cy"), "take the complete file"
-    )
+    arrays, keys = load_npz(path, skip=(_JPEG,)), ("tracks_XYZ", "visibility", "queries_xyt", "fx_fy_cx_cy")
+    require(path, arrays, "TAPVid-3D", keys, "take the complete file")
     if depth is None:
         raise ValueError(
             f'{path}: TAPVid-3D holds no depth; give depth="sparse" for that of its true points, or a file or folder of '
@@ -106,22 +103,16 @@ def read_depths(path: str | Path) -> np.ndarray:
         return np.stack([read_depth(x) for x in numbered(path, DEPTHS)])
     if path.suffix == ".npz":
         arrays = load_npz(path)
-        key = next(
-            (k for k in ("depths", "depth", *arrays) if k in arrays and (k[:5] == "depth" or len(arrays) == 1)), None
-        )
-        depths = arrays.get(key, np.zeros(0))
+        only = next(iter(arrays.values())) if len(arrays) == 1 else np.zeros(0)
+        depths = arrays.get("depths", arrays.get("depth", only))
     else:
         try:
             depths = np.load(path, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise ValueError(
-                f"{path}: not a readable file of depth ({error}); give npy, npz or a folder of images"
-            ) from None
+            raise ValueError(f"{path}: not a readable file of depth ({error}); give npy, npz or a folder") from None
     depths = depths[..., 0] if depths.ndim == 4 else depths
     if depths.ndim != 3 or depths.dtype.kind != "f":
-        raise ValueError(
-            f"{path}: expected depth (T, H, W) as floats in scene units, got {depths.shape} {depths.dtype}"
-        )
+        raise ValueError(f"{path}: expected depth (T, H, W), floats in scene units, got {depths.shape} {depths.dtype}")
     return depths.astype(np.float32)
 
 

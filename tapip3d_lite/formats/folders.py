@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -67,9 +67,7 @@ class Settings:
         if path.is_file():
             given |= read_json(path)
         if given.keys() - known:
-            raise ValueError(
-                f"{path}: unknown {', '.join(given.keys() - known)}; expected some of {', '.join(sorted(known))}"
-            )
+            raise ValueError(f"{path}: unknown {', '.join(given.keys() - known)}; known are {', '.join(sorted(known))}")
         return cls(**(defaults | ({"made_for": None} if "intrinsics" in given else {}) | given))
 
 
@@ -98,51 +96,55 @@ def load_parts(parts: Parts, frames: slice, name: str, depths: np.ndarray | None
         ValueError: counts that differ, unreadable or unfit images, unknown intrinsics.
     """
     s, count, given = parts.settings, len(parts.poses), len(parts.depth if depths is None else depths)
-    if isinstance(parts.color, Path):
-        video, colors, fps = read_video(parts.color, frames)
-        s = replace(s, fps=fps if 0 < fps < np.inf else s.fps)
-    else:
-        colors = len(parts.color)
+    film = isinstance(parts.color, Path)
+    video, colors, fps = read_video(parts.color, frames) if film else (None, len(parts.color), s.fps)
     if not colors == given == count:
         raise ValueError(
             f"{parts.folder}: {colors} colour frames, {given} of depth and {count} poses; each frame needs one of each: "
             "remove what has no partner"
         )
-    video = video if isinstance(parts.color, Path) else _images(parts.color[frames], parts.folder)
+    video = video if film else _images(parts.color[frames], parts.folder)
     size, poses = video.shape[1:3], np.asarray(parts.poses, np.float64)[frames]
     lengths = np.linalg.norm(poses[:, :3, :3], axis=(1, 2))  # of a rotation: sqrt(3)
     lost = np.flatnonzero(~((lengths > 0.1) & np.isfinite(poses).all((1, 2))))
     if len(lost):
-        raise ValueError(
-            f"{parts.folder}: the poses of frames {lost[:5].tolist()} are none (tracking was lost?); leave them out"
-        )
+        raise ValueError(f"{parts.folder}: poses {lost[:5].tolist()} are none (tracking lost?); leave those frames out")
     intrinsics = _intrinsics(parts, size)[frames]
     extrinsics = np.linalg.inv(poses) if s.poses == "camera_to_world" else poses
     extrinsics = _FLIP @ extrinsics if s.axes == "opengl" else extrinsics
     shift = np.eye(4) if s.color_from_depth is None else np.reshape(s.color_from_depth, (4, 4))
     if depths is None:
-        read = parts.read or (lambda path: read_depth(path, s.depth_scale, s.no_depth))
-        depths = [read(path) for path in parts.depth[frames]]
-        if s.depth_intrinsics is not None:
-            own = matrix(s.depth_intrinsics, "clip.json: depth_intrinsics")
-            depths = [register_depth(z, own, k, shift, size) for z, k in zip(depths, intrinsics, strict=True)]
-        depths = np.stack([fit_depth(z, size, x) for z, x in zip(depths, parts.depth[frames], strict=True)])
-        if s.depth_is == "ray":
-            depths = depths / np.linalg.norm(point_map(np.ones_like(depths), intrinsics), axis=-1)
+        depths = _depths(parts, frames, intrinsics, shift, size)
     else:
-        depths = depths[frames]
+        depths = np.stack([fit_depth(z, size, f"{parts.folder}: the given depth") for z in depths[frames]])
     extrinsics = shift @ extrinsics
     tracks = parts.tracks(frames, intrinsics, extrinsics, size) if parts.tracks else None
-    return Clip(video, depths, intrinsics, extrinsics, tracks=tracks, name=name, fps=float(s.fps))
+    return Clip(
+        video, depths, intrinsics, extrinsics, tracks=tracks, name=name, fps=float(fps if 0 < fps < np.inf else s.fps)
+    )
+
+
+def _depths(
+    parts: Parts, frames: slice, intrinsics: np.ndarray, shift: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """The layout's own depth as z (T, H, W) of the colour camera."""
+    s, depths = parts.settings, []
+    for path, k in zip(parts.depth[frames], intrinsics, strict=True):
+        depth = parts.read(path) if parts.read else read_depth(path, s.depth_scale, s.no_depth)
+        if s.depth_intrinsics is not None:
+            own = matrix(s.depth_intrinsics, "clip.json: depth_intrinsics")
+            depth = register_depth(depth, own, k, shift, size)
+        depths.append(fit_depth(depth, size, path))
+    depths = np.stack(depths)
+    rays = point_map(np.ones_like(depths), intrinsics) if s.depth_is == "ray" else np.ones(1)
+    return depths / np.linalg.norm(rays, axis=-1)
 
 
 def _images(paths: list[Path], folder: Path) -> np.ndarray:
     images = [decode_color(path.read_bytes(), path) for path in paths]
     sizes = {image.shape[1::-1] for image in images}
     if len(sizes) != 1:
-        raise ValueError(
-            f"{folder}: colour images of sizes {sorted(sizes) or 'none'}; expected at least one, all of one size"
-        )
+        raise ValueError(f"{folder}: colour images of sizes {sorted(sizes) or 'none'}; expected some, all of one size")
     return np.stack(images)
 
 
@@ -169,9 +171,7 @@ def matrix(given: Sequence, name: str) -> np.ndarray:
         raise ValueError(f"{name}: expected fx fy cx cy or a 3x3 matrix in rows, got {numbers.size} numbers")
     square = numbers.reshape(round(numbers.size**0.5), -1)[:3, :3]
     if not (square[[0, 1], [0, 1]] > 0).all():
-        raise ValueError(
-            f"{name}: focal lengths must be positive, got fx, fy = {square[0, 0]:g}, {square[1, 1]:g}; calibrate"
-        )
+        raise ValueError(f"{name}: focal lengths must be positive, got {square[0, 0]:g}, {square[1, 1]:g}; calibrate")
     return square
 
 
@@ -218,7 +218,7 @@ def read_poses(path: Path) -> np.ndarray:
     lengths = {len(row) for row in rows}
     if len(lengths) != 1 or not lengths <= {7, 8, 12, 16}:
         raise ValueError(
-            f"{path}: expected 16, 12, 7 (tx ty tz qx qy qz qw) or 8 numbers a pose, got {sorted(lengths)}"
+            f"{path}: expected 16, 12, 8 or 7 (tx ty tz qx qy qz qw) numbers a pose, got {sorted(lengths)}"
         )
     numbers = np.stack(rows)
     if lengths <= {7, 8}:
@@ -242,7 +242,5 @@ def numbered(folder: Path, suffixes: Sequence[str], pattern: str = "") -> list[P
         steps = np.diff(counting[:, 0])
         if (steps != steps.min()).any():
             gap = found[int(np.argmax(steps != steps.min()))].name
-            raise ValueError(
-                f"{folder}: a gap after {gap}; frames must follow one another: restore what is missing or renumber"
-            )
+            raise ValueError(f"{folder}: a gap after {gap}; restore what is missing, or renumber the frames")
     return found

@@ -47,15 +47,9 @@ def plain_folder(path: Path, needs_depth: bool = True) -> Parts:
 
 def tum(folder: Path) -> Parts:
     """TUM RGB-D: lists with time stamps. Depth within 20 ms of a colour frame is its own; poses are interpolated."""
-    color, depth, truth = (
-        _stamped(folder / "rgb.txt"),
-        _stamped(folder / "depth.txt"),
-        table(folder / "groundtruth.txt"),
-    )
+    (color, depth), truth = map(_stamped, (folder / "rgb.txt", folder / "depth.txt")), table(folder / "groundtruth.txt")
     if not color or not depth or {len(row) for row in truth} != {8}:
-        raise ValueError(
-            f"{folder}: rgb.txt and depth.txt need lines, groundtruth.txt such of 8 numbers: time tx ty tz qx qy qz qw"
-        )
+        raise ValueError(f"{folder}: expected lines in rgb.txt, depth.txt, groundtruth.txt (time tx ty tz qx qy qz qw)")
     truth = np.stack(sorted(truth, key=lambda row: row[0]))
     times, partners = np.array([t for t, _ in color]), np.array([t for t, _ in depth])
     nearest = np.abs(times[:, None] - partners).argmin(1)
@@ -83,9 +77,7 @@ def _stamped(path: Path) -> list[tuple[float, str]]:
     try:
         return sorted((float(seconds), name.strip()) for seconds, name in lines)
     except ValueError:
-        raise ValueError(
-            f"{path}: expected lines of a time stamp and a file, such as 1305031102.17 rgb/a.png"
-        ) from None
+        raise ValueError(f"{path}: expected lines of a time stamp and a file: 1305031102.17 rgb/a.png") from None
 
 
 def seven_scenes(folder: Path) -> Parts:
@@ -147,18 +139,14 @@ def kubric(folder: Path) -> Parts:
     missing = [x for x in ("depth_range", "traj_3d", "occluded", "intrinsics", "matrix_world") if x not in truth]
     if missing:
         raise ValueError(f"{path}: {', '.join(missing)} missing; it has {', '.join(map(str, truth))}")
-    low, high = map(float, truth["depth_range"])
+    read = partial(_between, **dict(zip(("low", "high"), map(float, truth["depth_range"]), strict=True)))
     color, depth = (numbered(folder / "frames", (".png",), end) for end in (r"^\d+\.png$", r"^\d+_depth\.png$"))
-    parts = _kubric(
-        folder, color, depth, truth["matrix_world"], truth["intrinsics"], partial(_between, low=low, high=high)
-    )
+    parts = _kubric(folder, color, depth, truth["matrix_world"], truth["intrinsics"], read)
     parts.tracks = partial(_kubric_tracks, truth)
     return parts
 
 
-def _kubric(
-    folder: Path, color: list[Path], depth: list[Path], poses: object, normalised: object, read: object
-) -> Parts:
+def _kubric(folder: Path, color: list, depth: list, poses: object, normalised: object, read: object) -> Parts:
     """Ray lengths, Blender's axes, and K of an image of size 1 that begins at 0: ours begins at -1/2."""
     intrinsics = np.abs(np.array(normalised, np.float64))  # K's second and third columns are negative, as the axes are
     intrinsics[:, :2, 2] -= 0.5
