@@ -11,13 +11,15 @@ from importlib import import_module
 __version__ = "0.1.0"
 
 _HOMES = {
-    "clip": ["Clip", "Tracks", "check_queries", "load_clip", "load_tracks"],
+    "clip": ["Clip", "Tracks", "check_queries", "load_tracks"],
+    "formats": ["load_clip", "save_clip"],
     "queries": ["grid_queries", "queries_from_pixels", "resolve_queries"],
     "check": ["check_clip"],
     "poses": ["carry", "estimate_poses", "steady_clip"],
     "simulate": ["SimulationConfig", "simulate_clip"],
     "evaluation.metrics": ["tapvid2d_metrics", "tapvid3d_metrics"],
     "evaluation.evaluate": ["evaluate"],
+    "export": ["export_tracks"],
     "trackers": ["list_trackers", "load_tracker"],
     "model.config": ["TrackerConfig"],
     "model.tracker": ["Tracker"],

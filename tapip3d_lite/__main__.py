@@ -20,18 +20,25 @@ from tyro.conf import Positional, arg
 import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.benchmark import ALL, METRICS, SPLITS, run_benchmark, summary_table
 from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
-from tapip3d_lite.files import write_text
+from tapip3d_lite.export import WRITERS
+from tapip3d_lite.files import check_suffix, write_text
+from tapip3d_lite.formats import FORMATS
 from tapip3d_lite.lab.card import model_card
 from tapip3d_lite.simulate import simulate_dataset
 from tapip3d_lite.trackers import tracker_runs
 from tapip3d_lite.training.recipe import TrainConfig
+
+Format = Annotated[str, arg(help="of the clip, if it is not recognised: " + ", ".join(FORMATS[1:]))]
 
 
 def track(
     clip: Positional[Path],
     /,
     tracker: Annotated[str, arg(help="a name of `list_trackers()` or a weights file")] = "lite",
-    out: Annotated[Path | None, arg(help="result npz in the authors' format")] = None,
+    format: Format = "auto",
+    out: Annotated[
+        tuple[Path, ...], arg(help="results: npz (the authors' format), csv, ply, mp4 or gif, by their suffix")
+    ] = (),
     html: Annotated[Path | None, arg(help="3D page with a time slider")] = None,
     png: Annotated[Path | None, arg(help="picture of frames with tracks")] = None,
     grid: Annotated[int, arg(help="queries on the first frame, side x side, where the clip has none")] = 16,
@@ -44,8 +51,11 @@ def track(
     steady: Annotated[bool, arg(help="first correct poses and depth scales that jitter")] = False,
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
 ) -> None:
-    """Track the points of a clip (npz) in 3D."""
-    loaded = t3d.load_clip(clip)
+    """Track the points of a clip in 3D."""
+    for path, allowed in (*((path, WRITERS) for path in out), (html, (".html",)), (png, (".png",))):
+        if path:
+            check_suffix(path, *allowed)  # before the work, not after it
+    loaded = t3d.load_clip(clip, format)
     queries = loaded.queries if own_queries and loaded.queries is not None else t3d.grid_queries(loaded, grid)
     given = replace(loaded, queries=queries)
     seen = t3d.steady_clip(given) if steady else given
@@ -56,13 +66,13 @@ def track(
     if loaded.tracks is not None and own_queries:
         scores = t3d.evaluate(result, loaded)
         print("  ".join(f"{name} {scores[name]:.3f}" for name in ("AJ3D", "APD3D", "OA")))
-    if out:
-        result.save(out, loaded)
+    for path in out:
+        t3d.export_tracks(result, path, loaded)
     if html:
         t3d.figures.save_html(t3d.figures.tracks_3d(loaded, result), html)
     if png:
         t3d.figures.save_png(t3d.figures.overview(loaded, result), png)
-    for path in filter(None, (out, html, png)):
+    for path in filter(None, (*out, html, png)):
         print(f"wrote {path}")
 
 
@@ -70,6 +80,7 @@ def evaluate(
     clips: Positional[tuple[Path, ...]],
     /,
     tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("lite", "static", "klt"),
+    format: Format = "auto",
     device: str = "cpu",
 ) -> None:
     """Score trackers on clips with true tracks; prints a Markdown table, one row a clip, then the means."""
@@ -78,7 +89,7 @@ def evaluate(
         loaded = t3d.load_tracker(name, device=device)
         scores = {}
         for path in tqdm(clips, desc=name, leave=False, disable=None):
-            clip = t3d.load_clip(path)
+            clip = t3d.load_clip(path, format)
             scores[f"{name} · {clip.name}"] = t3d.evaluate(loaded.track(clip), clip)
         rows, means = rows | scores, means | {f"{name} · mean": mean_scores(list(scores.values()))}
     print(score_table(rows | means, ("AJ3D", "APD3D", "OA", "AJ3D_none", "APD3D_none", "AJ3D_none_dynamic")))
@@ -110,17 +121,32 @@ def demo(
     clip: Positional[Path] = Path("data_samples/arc.npz"),
     /,
     tracker: str = "lite",
+    format: Format = "auto",
     out: Annotated[Path, arg(help="folder for the page and the picture")] = Path("demo_output"),
 ) -> None:
     """Track a sample clip and write a 3D page (HTML) and a picture (PNG)."""
-    track(clip, tracker=tracker, html=out / "tracks_3d.html", png=out / "tracks.png")
+    track(clip, tracker=tracker, format=format, html=out / "tracks_3d.html", png=out / "tracks.png")
     print(f"Open {(out / 'tracks_3d.html').resolve()} in a browser and move the time slider.")
 
 
-def check(clip: Positional[Path], /) -> None:
+def check(clip: Positional[Path], /, format: Format = "auto") -> None:
     """Look for the usual mistakes in a clip: camera direction, axes, intrinsics, units, ray length."""
-    findings = t3d.check_clip(t3d.load_clip(clip, points=False))
+    findings = t3d.check_clip(t3d.load_clip(clip, format, points=False))
     print("\n".join(map(str, findings)) if findings else f"{clip}: nothing suspicious found")
+
+
+def convert(
+    source: Positional[Path],
+    out: Positional[Path],
+    /,
+    format: Format = "auto",
+    depth: Annotated[str | None, arg(help="npy, npz or folder of depth to take instead; sparse, for TAPVid-3D")] = None,
+    frames: Annotated[tuple[int, int, int] | None, arg(help="start, stop and step, of a folder or a video")] = None,
+) -> None:
+    """Read a clip of any format and write it as npz, or (a name without suffix) as a folder of images."""
+    loaded = t3d.load_clip(source, format, depth, slice(*frames or (None,)))
+    t3d.save_clip(loaded, out)
+    print(f"wrote {out}: {len(loaded)} frames of {loaded.size[1]}x{loaded.size[0]}; next: check {out}")
 
 
 def simulate(
@@ -191,7 +217,7 @@ def import_(checkpoint: Positional[Path], out: Positional[Path], /) -> None:
     print(f"wrote {out}: {count / 1e6:.2f} M parameters; use it with --tracker {out}")
 
 
-_FUNCTIONS = (track, evaluate, benchmark, demo, check, simulate, train, card, curves, import_)
+_FUNCTIONS = (track, evaluate, benchmark, demo, check, convert, simulate, train, card, curves, import_)
 COMMANDS = {function.__name__.rstrip("_"): function for function in _FUNCTIONS}
 
 

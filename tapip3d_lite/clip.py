@@ -169,8 +169,8 @@ class Clip:
         save_npz(path, arrays)
 
 
-def load_clip(path: str | Path, points: bool = True) -> Clip:
-    """Read a clip from the authors' input npz or from one of ours.
+def load_own_clip(path: str | Path, points: bool = True) -> Clip:
+    """Read a clip from the authors' input npz or from one of ours; `formats.load_clip` reads others, too.
 
     A single (3, 3) or (4, 4) camera is taken for all frames.
 
@@ -183,7 +183,7 @@ def load_clip(path: str | Path, points: bool = True) -> Clip:
     """
     arrays, tracks = clip_arrays(path), None
     if points and "tracks" in arrays:
-        _require(path, arrays, "a clip with tracks", ("visible", "query_point"), "add the key or drop tracks")
+        require(path, arrays, "a clip with tracks", ("visible", "query_point"), "add the key or drop tracks")
         tracks = Tracks(arrays["tracks"], arrays["visible"], arrays["query_point"], None, arrays.get("dynamic"))
     return Clip(
         **{key: arrays[key] for key in _CLIP_KEYS},
@@ -199,7 +199,7 @@ def clip_arrays(path: str | Path, skip: Collection[str] = (), outline: Collectio
     """The arrays of a clip's file, with a camera for each frame, `name` and `fps`; `skip`, `outline` as for `load_npz`."""
     arrays = load_npz(path, skip, outline)
     remedy = "for RGB-only video estimate depth and pose first (e.g. with MegaSaM)"
-    _require(path, arrays, "a clip", [key for key in _CLIP_KEYS if key not in skip], remedy)
+    require(path, arrays, "a clip", [key for key in _CLIP_KEYS if key not in skip], remedy)
     frames = len(arrays["depths"]) if arrays["depths"].ndim else 0
     for key in ("intrinsics", "extrinsics"):
         if arrays[key].ndim == 2:
@@ -211,11 +211,11 @@ def load_tracks(path: str | Path) -> Tracks:
     """Read tracks from a result npz (`Tracks.save`, or the authors' result file).
 
     Raises:
-        ValueError: as for `load_clip`.
+        ValueError: as for `load_own_clip`.
     """
     arrays = load_npz(path)
     needed = ("coords", "visibs", "query_points")
-    _require(path, arrays, "a result", needed, "save one with Tracks.save")
+    require(path, arrays, "a result", needed, "save one with Tracks.save")
     return Tracks(*(arrays[key] for key in needed), arrays.get("visib_logits"), arrays.get("dynamic"))
 
 
@@ -253,7 +253,8 @@ def query_frames(clip: Clip, rows: np.ndarray) -> np.ndarray:
     return t.astype(int)
 
 
-def _require(path: str | Path, arrays: Mapping[str, np.ndarray], what: str, keys: Sequence[str], remedy: str) -> None:
+def require(path: str | Path, arrays: Mapping[str, np.ndarray], what: str, keys: Sequence[str], remedy: str) -> None:
+    """Raise ValueError unless a file's arrays have these keys."""
     missing = [key for key in keys if key not in arrays]
     if missing:
         raise ValueError(

@@ -64,8 +64,17 @@ def _outline(data: np.lib.npyio.NpzFile, key: str) -> np.ndarray:
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 
+def check_suffix(path: str | Path, *allowed: str) -> str:
+    """The suffix of a path, in lower case; ValueError unless it is one of those allowed."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in allowed:
+        raise ValueError(f"{path}: this is written as {', '.join(allowed)}, got {suffix or 'no suffix'}; rename it")
+    return suffix
+
+
 def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray | None]) -> None:
-    """Write a compressed npz atomically, without what is None."""
+    """Write a compressed npz atomically, without what is None; another suffix is a ValueError."""
+    check_suffix(path, ".npz")
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **{key: value for key, value in arrays.items() if value is not None})
 

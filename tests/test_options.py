@@ -89,9 +89,14 @@ def arguments(lite, clip, file, folder):
         "extrinsics": clip.extrinsics[0],
     }
     pred.save(folder / "tracks.npz")
+    t3d.save_clip(clip, folder / "images")
+    np.save(folder / "depth.npy", clip.depths)
     cpu = torch.device("cpu")
     return {
-        "load_clip": {"path": file, "points": False},
+        "load_clip": {"path": folder / "images", "format": "folder", "depth": folder / "depth.npy", "frames": slice(0, 4),
+                      "points": False},
+        "save_clip": {"clip": clip, "path": folder / "clip.npz"},
+        "export_tracks": {"tracks": pred, "path": folder / "tracks.csv", "clip": clip},
         "load_tracks": {"path": folder / "tracks.npz"},
         "check_queries": {"clip": clip, "queries": rows},
         "grid_queries": {"clip": clip, "side": 3, "frame": 2, "margin": 0.1},
@@ -202,14 +207,16 @@ def lines(sample, folder):
     run, results = folder / "run", folder / "results.json"
     train = ["train", "--out", run, "--data", folder / "clips", "--device", "cpu", "--workers", 0, "--no-compiled"]
     return [
-        ["check", sample],
-        ["track", sample, "--tracker", "lite", "--out", folder / "out.npz", "--html", folder / "out.html",
+        ["convert", sample, folder / "images", "--format", "npz"],
+        ["convert", folder / "images", folder / "short.npz", "--frames", 0, 8, 2, "--depth", folder / "images" / "depth"],
+        ["check", sample, "--format", "npz"],
+        ["track", sample, "--tracker", "lite", "--format", "npz", "--out", folder / "out.npz", folder / "out.ply", "--html", folder / "out.html",
          "--png", folder / "out.png", "--space", "camera", "--device", "cpu"],
         ["track", sample, "--grid", 3, "--no-own-queries", "--size", 96, 96, "--crop", 0, 8, 120, 128, "--steady"],
-        ["evaluate", sample, "--tracker", "lite", "static", "--device", "cpu"],
+        ["evaluate", sample, "--tracker", "lite", "static", "--format", "npz", "--device", "cpu"],
         ["benchmark", "--tracker", "lite", "--split", "occlusion", "--space", "camera", "--count", 1, "--out", results,
          "--figure", folder / "scores.png", "--device", "cpu"],
-        ["demo", sample, "--tracker", "lite", "--out", folder / "demo"],
+        ["demo", sample, "--tracker", "lite", "--format", "npz", "--out", folder / "demo"],
         ["simulate", "--out", folder / "set", "--count", 1, "--first-seed", 1, "--workers", 1, *flags(SIMULATION)],
         [*train, *flags(recipe), "--tracker", "neighbors", 4],
         [*train, "--resume"],
@@ -236,7 +243,7 @@ def test_every_line_runs(sample, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["tapip3d_lite", *map(str, line)])
         __main__.main()
     shown = capsys.readouterr().out
-    for made in ("out.npz", "out.html", "out.png", "scores.png", "CARD.md", "curves.png"):
+    for made in ("short.npz", "out.npz", "out.ply", "out.html", "out.png", "scores.png", "CARD.md", "curves.png"):
         assert (tmp_path / made).stat().st_size > 500 and f"wrote {tmp_path / made}" in shown
     assert "9 points over 8 frames with lite" in shown and "static · mean" in shown and "finished: " in shown
     assert sorted(path.name for path in (tmp_path / "set").iterdir()) == ["clip_000001.npz", "dataset.json"]

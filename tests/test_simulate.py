@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lessons import samples
-from tapip3d_lite.clip import load_clip
+from tapip3d_lite.formats import load_clip
 from tapip3d_lite.geometry import project, unproject
 from tapip3d_lite.simulate import SimulationConfig, simulate_clip, simulate_dataset, simulator
 from tapip3d_lite.simulate.bodies import random_scene

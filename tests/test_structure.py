@@ -20,11 +20,13 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = [
     ["geometry", "files", "validate"],
     ["clip", "queries", "bundle", "poses"],
+    ["formats"],
     ["check", "simulate", "model"],
     ["variants", "speed"],
     ["checkpoint_reader", "official", "recorder"],
     ["training", "evaluation"],
     ["figures"],
+    ["export"],
     ["trackers"],
     ["lab"],
     ["__main__", ""],

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tapip3d_lite.clip import Clip, Tracks, load_clip
+from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
+from tapip3d_lite.formats import load_clip
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
 from tapip3d_lite.simulate.seeds import TRAINING, VALIDATION

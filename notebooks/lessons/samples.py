@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from lessons.tool import ToolParser
-from tapip3d_lite.clip import Clip, load_clip
+from tapip3d_lite.clip import Clip
 from tapip3d_lite.figures import overview, save_png
 from tapip3d_lite.files import atomic_path
+from tapip3d_lite.formats import load_clip
 from tapip3d_lite.simulate.settings import SimulationConfig
 from tapip3d_lite.simulate.simulator import simulate_clip
 

@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from tapip3d_lite.clip import Clip, load_clip
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.formats import load_clip
 from tapip3d_lite.simulate import Rollout, render_clip
 from tapip3d_lite.simulate.dataset import run_jobs
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade, wrong_poses

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from tapip3d_lite.figures.flat import contact_sheet, depth_map, frame_with_tracks, overview, track_colors
 from tapip3d_lite.figures.scene_3d import tracks_3d, tracks_3d_static
-from tapip3d_lite.files import atomic_path, write_text
+from tapip3d_lite.files import atomic_path, check_suffix, write_text
 
 __all__ = ["contact_sheet", "depth_map", "frame_with_tracks", "overview", "track_colors"]
 __all__ += ["save_html", "save_png", "show_3d", "tracks_3d", "tracks_3d_static"]
@@ -57,13 +57,15 @@ def png_bytes(figure: Figure, dpi: int = 90) -> bytes:
 
 
 def save_png(figure: Figure, path: str | Path, dpi: int = 110) -> None:
-    """Write a matplotlib figure as PNG, atomically."""
+    """Write a matplotlib figure as PNG, atomically; another suffix is a ValueError."""
+    check_suffix(path, ".png")
     with atomic_path(path) as temporary:
         temporary.write_bytes(png_bytes(figure, dpi))
 
 
 def save_html(figure: go.Figure, path: str | Path) -> None:
     """Write a plotly figure as one page that needs no network (plotly.js is inside, about 5 MB), atomically."""
+    check_suffix(path, ".html")
     write_text(path, figure.to_html(include_plotlyjs=True, auto_play=False, validate=False))
 
 

@@ -19,8 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tapip3d_lite.clip import Clip, Tracks, clip_arrays, load_clip
+from tapip3d_lite.clip import Clip, Tracks, clip_arrays
 from tapip3d_lite.files import atomic_path, load_npz
+from tapip3d_lite.formats import load_clip
 from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.encoder import Encoder

@@ -1,0 +1,112 @@
+"""Tracks for other programs: tables, meshes, films. The suffix decides, and an unknown one is an error."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.figures.flat import check_drawable, track_colors
+from tapip3d_lite.files import atomic_path, check_suffix
+from tapip3d_lite.geometry import project
+
+_TAIL = 8  # frames
+
+
+def export_tracks(tracks: Tracks, path: str | Path, clip: Clip) -> None:
+    """Write the tracks of a clip, atomically, as what the suffix says.
+
+    - `.npz`: the authors' result, with all that their viewer needs.
+    - `.csv`: a line for each frame and track: frame, track, x, y, z (world), visible, u, v (pixels; empty behind the camera).
+    - `.ply`: points with colours, `frame`, `track` and `visible`, and edges along the tracks (binary; world coordinates).
+    - `.mp4` (MPEG-4), `.gif` (256 fixed colours): the video with the points, filled where visible, and their tails.
+
+    Raises:
+        ValueError: another suffix, tracks of another length than the clip's, or OpenCV cannot write the film.
+    """
+    write = WRITERS[check_suffix(path, *WRITERS)]
+    check_drawable(clip, tracks)
+    with atomic_path(path) as temporary:
+        write(tracks, temporary, clip)
+
+
+def _csv(tracks: Tracks, path: Path, clip: Clip) -> None:
+    frames, count = tracks.visible.shape
+    t, n = np.divmod(np.arange(frames * count), count)
+    uv, z = project(tracks.xyz, clip.intrinsics, clip.extrinsics)
+    uv = np.where(z[..., None] > 0, uv, np.nan).reshape(-1, 2)
+    lines = io.StringIO("frame,track,x,y,z,visible,u,v\n")
+    lines.seek(0, io.SEEK_END)
+    rows = np.column_stack([t, n, tracks.xyz.reshape(-1, 3), tracks.visible.ravel(), uv])
+    np.savetxt(lines, rows, fmt="%d,%d,%.7g,%.7g,%.7g,%d,%.3f,%.3f")
+    path.write_text(lines.getvalue().replace("nan", ""), encoding="utf-8")
+
+
+def _ply(tracks: Tracks, path: Path, clip: Clip) -> None:
+    frames, count = tracks.visible.shape
+    fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue", "visible")]
+    vertices = np.zeros((frames, count), [*fields, ("frame", "<i4"), ("track", "<i4")])
+    for name, values in zip("xyz", np.moveaxis(tracks.xyz, -1, 0), strict=True):
+        vertices[name] = values
+    for name, values in zip(("red", "green", "blue"), track_colors(clip, tracks).T, strict=True):
+        vertices[name] = np.rint(values * 255)
+    vertices["visible"], vertices["track"] = tracks.visible, np.arange(count)
+    vertices["frame"] = np.arange(frames)[:, None]
+    index = np.arange(frames * count, dtype="<i4").reshape(frames, count)
+    edges = np.stack([index[:-1], index[1:]], -1).reshape(-1, 2)
+    kinds = {"<f4": "float", "u1": "uchar", "<i4": "int", "|u1": "uchar"}
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {vertices.size}"]
+    head += [f"property {kinds[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names]
+    head += [f"element edge {len(edges)}", "property int vertex1", "property int vertex2", "end_header\n"]
+    path.write_bytes("\n".join(head).encode() + vertices.tobytes() + edges.tobytes())
+
+
+def overlay(tracks: Tracks, clip: Clip) -> np.ndarray:
+    """The video (T, H', W', 3) uint8 with the points, filled where visible, and their tails; small images are enlarged."""
+    scale = max(1, round(480 / clip.size[0]))
+    colors = (track_colors(clip, tracks) * 255).astype(int).tolist()
+    uv, z = project(tracks.xyz, clip.intrinsics, clip.extrinsics)
+    # Subpixel drawing: 4 bits after the point. A point out of sight is far away, so it needs no test.
+    places = np.where(((z > 0) & np.isfinite(uv).all(-1))[..., None], ((uv + 0.5) * scale - 0.5) * 16, -1e6)
+    places = np.rint(np.clip(places, -1e6, 1e6)).astype(int)
+    shown = clip.video.repeat(scale, 1).repeat(scale, 2)
+    for t, image in enumerate(shown):
+        for n, color in enumerate(colors):
+            line = places[max(0, t - _TAIL) : t + 1, n]
+            line = line[(line > -1e6).all(-1)].reshape(-1, 1, 2).astype(np.int32)
+            cv2.polylines(image, [line], False, color, 1, cv2.LINE_AA, 4)
+            where, filled = tuple(places[t, n].tolist()), cv2.FILLED if tracks.visible[t, n] else 1
+            cv2.circle(image, where, 3 * 16, color, filled, cv2.LINE_AA, 4)
+    return shown
+
+
+def _mp4(tracks: Tracks, path: Path, clip: Clip) -> None:
+    film = overlay(tracks, clip)
+    film = film[:, : film.shape[1] // 2 * 2, : film.shape[2] // 2 * 2]  # the codec wants even sizes
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), clip.fps, film.shape[2:0:-1])
+    if not writer.isOpened():
+        raise ValueError(f"{path}: this OpenCV writes no MP4; choose .gif")
+    for image in film:
+        writer.write(np.ascontiguousarray(image[..., ::-1]))
+    writer.release()
+
+
+def _gif(tracks: Tracks, path: Path, clip: Clip) -> None:
+    film = cv2.Animation()
+    film.frames = [np.ascontiguousarray(image[..., ::-1]) for image in overlay(tracks, clip)]
+    film.durations = [round(1000 / clip.fps)] * len(clip)
+    if not cv2.imwriteanimation(str(path), film):
+        raise ValueError(f"{path}: this OpenCV writes no GIF; choose .mp4")
+
+
+WRITERS: dict[str, Callable[[Tracks, Path, Clip], None]] = {
+    ".npz": Tracks.save,
+    ".csv": _csv,
+    ".ply": _ply,
+    ".mp4": _mp4,
+    ".gif": _gif,
+}

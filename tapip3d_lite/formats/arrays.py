@@ -1,0 +1,124 @@
+"""Clips in npz files: the authors' results, TAPVid-3D, MegaSaM, VGGT and Depth Anything 3."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from tapip3d_lite.clip import Clip, Tracks, require
+from tapip3d_lite.files import load_npz
+from tapip3d_lite.formats.folders import matrix, numbered
+from tapip3d_lite.formats.images import DEPTHS, decode_color, fit_depth, read_depth
+from tapip3d_lite.formats.unpickle import load_objects
+from tapip3d_lite.geometry import in_image, invert, project, transform
+
+_JPEG = "images_jpeg_bytes"
+
+
+def npz_keys(path: Path) -> set[str]:
+    """The names of an npz file's arrays; none where it is no zip file."""
+    if not zipfile.is_zipfile(path):
+        return set()
+    with zipfile.ZipFile(path) as archive:
+        return {name.removesuffix(".npy") for name in archive.namelist()}
+
+
+def result(path: Path, points: bool) -> Clip:
+    """The authors' result: the clip in it with its queries (`load_tracks` reads the tracks)."""
+    arrays = load_npz(path)
+    keys = ("video", "depths", "intrinsics", "extrinsics")
+    require(path, arrays, "a result with its clip", keys, "give `save` the clip")
+    video, *cameras = (arrays[key] for key in keys)
+    return Clip(_video(video), *cameras, arrays.get("query_points") if points else None, name=path.stem)
+
+
+def megasam(path: Path, _points: bool) -> Clip:
+    """MegaSaM: `images`, `depths`, one `intrinsic` (3, 3), `cam_c2w` (T, 4, 4) camera to world."""
+    arrays = load_npz(path)
+    require(path, arrays, "MegaSaM's output", ("images", "depths", "intrinsic", "cam_c2w"), "take its *_sgd_cvd_hr.npz")
+    poses = invert(arrays["cam_c2w"].astype(np.float64))
+    intrinsics = np.broadcast_to(arrays["intrinsic"], (len(poses), 3, 3))
+    return Clip(_video(arrays["images"]), arrays["depths"], intrinsics, poses, name=path.stem)
+
+
+def vggt(path: Path, _points: bool) -> Clip:
+    """VGGT and Depth Anything 3: images as bytes or in [0, 1], depth (T, H, W) or with a last axis, extrinsics (T, 3, 4)."""
+    arrays = {key.removesuffix("s"): value for key, value in load_npz(path).items()}
+    keys = ("image", "depth", "intrinsic", "extrinsic")
+    require(path, arrays, "such a clip", keys, "export the images and the cameras with the depth")
+    batch = arrays["image"].ndim == 5  # of one clip
+    images, depths, intrinsics, top = (arrays[key][0] if batch else arrays[key] for key in keys)
+    extrinsics = np.tile(np.eye(4), (len(top), 1, 1))
+    extrinsics[:, :3] = top[:, :3]
+    return Clip(_video(images), depths[..., 0] if depths.ndim == 4 else depths, intrinsics, extrinsics, name=path.stem)
+
+
+def tapvid3d(path: Path, points: bool, depth: str | Path | None = None) -> Clip:
+    """TAPVid-3D: JPEG images, tracks in each frame's camera, one camera matrix, poses or none; depth comes from elsewhere."""
+    arrays, keys = load_npz(path, skip=(_JPEG,)), ("tracks_XYZ", "visibility", "queries_xyt", "fx_fy_cx_cy")
+    require(path, arrays, "TAPVid-3D", keys, "take the complete file")
+    if depth is None:
+        raise ValueError(
+            f'{path}: TAPVid-3D holds no depth; give depth="sparse" for that of its true points, or a file or folder of '
+            'estimated depth: depth="depths.npy", (T, H, W) in metres'
+        )
+    with zipfile.ZipFile(path) as archive, archive.open(f"{_JPEG}.npy") as file:
+        images = load_objects(path, file)
+    video = np.stack([decode_color(bytes(image), f"{path}: image {t}") for t, image in enumerate(images)])
+    xyz, visible = arrays["tracks_XYZ"].astype(np.float64), arrays["visibility"].astype(bool)
+    intrinsics = np.tile(matrix(arrays["fx_fy_cx_cy"], f"{path}: fx_fy_cx_cy"), (len(video), 1, 1))
+    extrinsics = arrays.get("extrinsics_w2c", np.eye(4)).astype(np.float64)
+    extrinsics = np.broadcast_to(extrinsics, (len(video), 4, 4))
+    size = video.shape[1:3]
+    if depth == "sparse":
+        depths = _sparse(xyz, visible, intrinsics, size)
+    else:
+        depths = np.stack([fit_depth(image, size, depth) for image in read_depths(depth)])
+    world = transform(xyz, invert(extrinsics))
+    times = np.rint(arrays["queries_xyt"][:, 2]).astype(int)
+    queries = np.concatenate([times[:, None], world[times, np.arange(len(times))]], 1)
+    tracks = Tracks(world, visible, queries) if points else None
+    return Clip(video, depths, intrinsics, extrinsics, tracks=tracks, name=path.stem, fps=30.0)
+
+
+def _sparse(xyz: np.ndarray, visible: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Depth (T, H, W) at the pixels of the visible points (T, N, 3) in camera space, elsewhere 0; the nearest counts."""
+    depths = np.zeros((len(xyz), *size), np.float32)
+    uv, z = project(xyz, intrinsics)
+    shown = visible & in_image(xyz, intrinsics, np.eye(4), size)
+    t, n = np.nonzero(shown)
+    far_first = np.argsort(-z[t, n])
+    t, n = t[far_first], n[far_first]
+    u, v = np.clip(np.rint(uv[t, n]).astype(int), 0, (size[1] - 1, size[0] - 1)).T
+    depths[t, v, u] = z[t, n]
+    return depths
+
+
+def read_depths(path: str | Path) -> np.ndarray:
+    """Depth maps (T, h, w) of an npy file, of an npz file's only array or its `depths` or `depth`, or of a folder of images."""
+    path = Path(path)
+    if path.is_dir():
+        return np.stack([read_depth(x) for x in numbered(path, DEPTHS)])
+    if path.suffix == ".npz":
+        arrays = load_npz(path)
+        only = next(iter(arrays.values())) if len(arrays) == 1 else np.zeros(0)
+        depths = arrays.get("depths", arrays.get("depth", only))
+    else:
+        try:
+            depths = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise ValueError(f"{path}: not a readable file of depth ({error}); give npy, npz or a folder") from None
+    depths = depths[..., 0] if depths.ndim == 4 else depths
+    if depths.ndim != 3 or depths.dtype.kind != "f":
+        raise ValueError(f"{path}: expected depth (T, H, W), floats in scene units, got {depths.shape} {depths.dtype}")
+    return depths.astype(np.float32)
+
+
+def _video(images: np.ndarray) -> np.ndarray:
+    """(T, H, W, 3) uint8 of images with colours first or last, up to 255 or up to 1."""
+    images = np.moveaxis(images, 1, -1) if images.ndim == 4 and images.shape[1] == 3 != images.shape[-1] else images
+    if images.dtype.kind == "f":
+        images = np.rint(np.clip(images * (255 if images.max() <= 1 else 1), 0, 255)).astype(np.uint8)
+    return np.ascontiguousarray(images)

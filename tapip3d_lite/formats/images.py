@@ -1,0 +1,178 @@
+"""Frames from files: colour images, depth images (PNG, TIFF, EXR, npy), videos; depth of another size or camera.
+
+OpenCV's wheels without a display (opencv-python-headless 5) are built without OpenEXR, whatever
+OPENCV_IO_ENABLE_OPENEXR says, so EXR is read here: scan lines, uncompressed or ZIP, the first channel.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tapip3d_lite.geometry import pixel_grid, project, resize_intrinsics, transform, unproject
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+DEPTHS = (".png", ".tif", ".tiff", ".exr", ".npy", ".pfm")
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+
+
+def decode_color(data: bytes, name: object) -> np.ndarray:
+    """An image file's bytes as (H, W, 3) uint8 RGB, as stored: without alpha, not turned by EXIF."""
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if image is None:
+        raise ValueError(
+            f"{name}: not a readable image; it may be truncated or of an unknown kind: save it as PNG or JPEG"
+        )
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def read_video(path: Path, frames: slice) -> tuple[np.ndarray, int, float]:
+    """The chosen frames (T, H, W, 3) uint8 RGB of a video, how many it has, and frames per second.
+
+    Raises:
+        ValueError: the file cannot be opened (an unknown codec), or holds no such frame.
+    """
+    video, chosen, wanted, count = cv2.VideoCapture(str(path)), [], range(*frames.indices(1 << 40)), 0
+    while video.grab():
+        if count in wanted:
+            chosen.append(np.ascontiguousarray(video.retrieve()[1][..., ::-1]))
+        count += 1
+    fps = video.get(cv2.CAP_PROP_FPS)
+    video.release()
+    if not chosen:
+        found = f"{count} frames, none of them in {frames}" if count else "no frame that OpenCV can decode"
+        raise ValueError(
+            f"{path}: {found}; if the codec is unknown, convert it (ffmpeg -i IN -c:v libx264 OUT.mp4) or write its frames "
+            "(ffmpeg -i IN rgb/%06d.png)"
+        )
+    return np.stack(chosen), count, fps
+
+
+def read_depth(path: Path, scale: float = 1000.0, no_depth: float = 65535) -> np.ndarray:
+    """A depth image (H, W) float32: whole numbers are divided by `scale`, `no_depth` is unknown; others are as stored.
+
+    Raises:
+        ValueError: unreadable, 8-bit, or of several channels that differ.
+    """
+    data = path.read_bytes()
+    if path.suffix.lower() == ".exr":
+        depth = decode_exr(data, path)
+    elif path.suffix.lower() == ".npy":
+        depth = np.load(path, allow_pickle=False)
+    else:
+        depth = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if depth is None:
+        raise ValueError(
+            f"{path}: not a readable depth image; write 16-bit PNG (millimetres), TIFF, EXR or npy (metres)"
+        )
+    depth = depth[..., 0] if depth.ndim == 3 and (depth == depth[..., :1]).all() else depth
+    if depth.dtype.itemsize == 1 or depth.ndim != 2:
+        raise ValueError(
+            f"{path}: depth of shape {depth.shape} {depth.dtype} is a picture for the eye, with too few steps; export it "
+            "as 16-bit PNG (millimetres), or as TIFF, EXR or npy in metres"
+        )
+    if depth.dtype.kind in "iu":
+        return np.where(depth == no_depth, 0, depth).astype(np.float32) / np.float32(scale)
+    return np.where(depth < 1e6, depth, 0).astype(np.float32)  # renderers write 1e10 for nothing
+
+
+def fit_depth(depth: np.ndarray, size: tuple[int, int], name: object) -> np.ndarray:
+    """Depth of the same camera brought to the image's size (H, W): each pixel takes the nearest, nothing is mixed."""
+    if depth.shape == tuple(size):
+        return depth
+    if abs(depth.shape[1] / depth.shape[0] * size[0] / size[1] - 1) > 0.02:
+        raise ValueError(
+            f"{name}: depth of {depth.shape[1]}x{depth.shape[0]} is of another shape than the {size[1]}x{size[0]} image; "
+            "turn or crop one, or give the depth camera's `depth_intrinsics` in clip.json"
+        )
+    return cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+
+
+def register_depth(
+    depth: np.ndarray,
+    depth_intrinsics: np.ndarray,
+    intrinsics: np.ndarray,
+    color_from_depth: np.ndarray,
+    size: tuple[int, int],
+) -> np.ndarray:
+    """Depth (h, w) of one camera as the colour camera beside it sees it: (H, W), 0 where nothing was measured.
+
+    X_color = color_from_depth X_depth, rounded to pixels; of several points that meet in one, the nearest counts.
+    A depth camera of fewer pixels than the image is enlarged first, so that its pixels leave no holes.
+    """
+    if depth.shape[0] < size[0]:
+        larger = tuple(math.ceil(size[0] / depth.shape[0]) * n for n in depth.shape)
+        depth_intrinsics = resize_intrinsics(depth_intrinsics, depth.shape, larger)
+        depth = cv2.resize(depth, larger[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    known = depth > 0
+    uv = pixel_grid(*depth.shape, like=np.zeros(0))[known]
+    points = unproject(uv, depth[known].astype(np.float64), depth_intrinsics)
+    uv, z = project(transform(points, color_from_depth), intrinsics)
+    u, v = np.rint(uv).astype(int).T
+    order = np.argsort(-z)  # the nearest is written last
+    order = order[((z > 0) & (u >= 0) & (v >= 0) & (u < size[1]) & (v < size[0]))[order]]
+    registered = np.zeros(size, np.float32)
+    registered[v[order], u[order]] = z[order]
+    return registered
+
+
+def decode_exr(data: bytes, name: object) -> np.ndarray:
+    """The first channel (H, W) of an OpenEXR file's bytes, as float32.
+
+    Raises:
+        ValueError: not an EXR file, truncated, tiled, or compressed by another method than ZIP.
+    """
+    try:
+        if data[:4] != b"\x76\x2f\x31\x01" or data[5] & 0x1A:
+            raise ValueError("not a plain EXR file of scan lines")
+        header, at = {}, 8
+        while data[at]:
+            key, kind = data.index(0, at), data.index(0, data.index(0, at) + 1)
+            (length,) = struct.unpack_from("<i", data, kind + 1)
+            header[data[at:key]] = data[kind + 5 : kind + 5 + length]
+            at = kind + 5 + length
+        left, top, right, bottom = struct.unpack("<4i", header[b"dataWindow"])
+        types = [np.dtype(("<u4", "<f2", "<f4")[kind]) for kind in _channels(header[b"channels"])]
+        method = header[b"compression"][0]
+        if method not in (0, 2, 3):
+            raise ValueError(f"compression {method} is not read, only none and ZIP")
+        width, height, rows = right - left + 1, bottom - top + 1, 16 if method == 3 else 1
+        line = width * sum(kind.itemsize for kind in types)
+        image = np.zeros((height, width), np.float32)
+        for (start,) in struct.iter_unpack("<Q", data[at + 1 : at + 1 + 8 * math.ceil(height / rows)]):
+            y, length = struct.unpack_from("<2i", data, start)
+            count = min(rows, bottom + 1 - y)
+            block = data[start + 8 : start + 8 + length]
+            block = _unzipped(block) if method and length < count * line else block
+            table = np.frombuffer(block, np.uint8).reshape(count, line)[:, : width * types[0].itemsize]
+            image[y - top : y - top + count] = np.ascontiguousarray(table).view(types[0])
+    except (ValueError, KeyError, IndexError, struct.error, zlib.error) as error:
+        raise ValueError(
+            f"{name}: not a readable depth image ({error}); write it as TIFF, npy or EXR with ZIP"
+        ) from None
+    return image
+
+
+def _channels(data: bytes) -> Iterator[int]:
+    at = 0
+    while data[at]:
+        at = data.index(0, at) + 1
+        yield struct.unpack_from("<i", data, at)[0]
+        at += 16
+
+
+def _unzipped(block: bytes) -> bytes:
+    """EXR's ZIP: differences of neighbouring bytes, even bytes before odd ones."""
+    values = np.frombuffer(zlib.decompress(block), np.uint8).astype(np.int64)
+    values[1:] -= 128
+    values = np.cumsum(values).astype(np.uint8)
+    mixed, half = np.empty_like(values), (len(values) + 1) // 2
+    mixed[::2], mixed[1::2] = values[:half], values[half:]
+    return mixed.tobytes()
