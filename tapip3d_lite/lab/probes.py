@@ -218,18 +218,18 @@ def _space(owner: Tracker, config: TrackerConfig, g: torch.Generator) -> Probe:
             "from_world of queries": space.from_world(rows, *own),
             "to_world": space.to_world(coords, *cameras, x["depths"]),
             "to_pixels": space.to_pixels(coords, *cameras),
-            "to_pixels of lift": space.to_pixels(cloud.flatten(2, 3), *cameras).unflatten(2, cloud.shape[2:4]),
         }
 
     def expected(out: Tensors) -> dict:
         points, grid = x["xyz"].shape, x["depths"].shape
         queries = (_BATCH, _TRACKS, 1, 3)
-        shapes = (*grid, 3), points, queries, points, (*points[:3], 2), (*grid, 2)
+        shapes = (*grid, 3), points, queries, points, (*points[:3], 2)
         return {name: (tuple(shape), torch.float32) for name, shape in zip(out, shapes, strict=True)}
 
     def facts(owner: Tracker, x: Tensors, out: Tensors) -> list:
-        flat = getattr(fitted(owner.space, frames_of(x)), "free_axes", (1.0, 1.0, 1.0))[2] == 0
-        seen, pixels = project(x["xyz"], x["intrinsics"], x["extrinsics"])[0], out["to_pixels of lift"]
+        space, cameras = fitted(owner.space, frames_of(x)), (x["intrinsics"], x["extrinsics"])
+        flat, seen = getattr(space, "free_axes", (1.0, 1.0, 1.0))[2] == 0, project(x["xyz"], *cameras)[0]
+        pixels = space.to_pixels(out["lift"].float().flatten(2, 3), *cameras).unflatten(2, x["depths"].shape[2:])
         known, grid = x["depths"] > 0, pixel_grid(*x["depths"].shape[2:], x["depths"]).expand(pixels.shape)
         return [
             ("to_world is not the inverse of from_world", x["xyz"] if flat else out["to_world"], x["xyz"]),
