@@ -332,8 +332,8 @@ def test_switches_are_guessed_and_functions_tried():
         return (kept[:, None, :, :1] * near.features).sum(-1)[..., :3]
 
     looks.width = 3
-    assert [lab.check_part(x).switch for x in (near, still, looks)] == ["neighborhood", "updater", "context"]
-    assert all(lab.check_part(x).ok for x in (near, still, looks))
+    reports = [lab.check_part(x) for x in (near, still, looks)]
+    assert [(x.switch, x.ok) for x in reports] == [("neighborhood", True), ("updater", True), ("context", True)]
     assert (
         lab.check_part(LossConfig(soften=2.0)).ok and lab.check_part("tapip3d_lite.model.n2n:N2N").switch == "context"
     )
