@@ -234,6 +234,7 @@ BROKEN = [
     ("space", "device", lift(lambda x: x + torch.zeros(3)), "made on the CPU"),
     ("loss", "device", loss(lambda self, x, counted: MEAN(self, x * torch.ones(x.shape[1:]), counted)), "made on the CPU"),
     ("updater", "device", updater(lambda self, x, _: x + float(np.mean(x.detach().numpy())) * 0), "values are taken to the CPU"),
+    ("updater", "device", type("Broken", (Layer,), {"sync_free": True, "change": lambda self, x, _: x * bool(x.sum() < 1e9)}), "sync_free"),
     # numbers
     ("context", "finite", context(lambda self, x, near: x.log()), "for ordinary inputs"),
     ("context", "finite", Blind, "where no cell of a frame is valid"),

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 import tapip3d_lite as t3d
-from tapip3d_lite import parts
+from tapip3d_lite import lab, parts
 from tapip3d_lite.evaluation.benchmark import version_of
 from tapip3d_lite.lab.train import train
 from tapip3d_lite.model import registry
@@ -438,6 +438,16 @@ def test_from_file_to_result_by_command_line(folder, clips):
     assert result.returncode == 2 and "give it or them" in result.stderr
     result = call(*run[:2], "other", "--tracker", "context", "my_part:A", cwd=folder)
     assert result.returncode == 2 and "module 'my_part' cannot be imported" in result.stderr
+
+
+def test_the_readmes_part_keeps_the_contract(folder):
+    (code,) = (
+        block
+        for block in re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
+        if "MyContext(Context)" in block
+    )
+    (folder / "my_parts.py").write_text(code)
+    assert str(lab.check_part("my_parts:MyContext")) == "MyContext (context): keeps the contract"
 
 
 def test_part_names():

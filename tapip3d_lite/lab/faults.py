@@ -44,7 +44,7 @@ def examine(probe: Probe, switch: str, config: TrackerConfig, faults: dict[str, 
         add(_apart(probe))
         add(_values(probe, out))
         add(_precision(probe, switch))
-        add(_device(probe, notes))
+        add(_device(probe, switch, notes))
     add(_gradients(probe, switch))
     if not faults:
         add(_whole(probe, switch, config))
@@ -186,7 +186,7 @@ class _OneDevice(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def _device(probe: Probe, notes: list[str]) -> Faults:
+def _device(probe: Probe, switch: str, notes: list[str]) -> Faults:
     """Whether everything is made where the inputs are, seen on the device "meta", which has no values."""
     owner = copy.deepcopy(probe.owner).to("meta")
     inputs = {name: x.to("meta") for name, x in probe.inputs.items()}
@@ -206,8 +206,10 @@ def _device(probe: Probe, notes: list[str]) -> Faults:
                 f"values are taken to the CPU ({said(error)}), expected torch operations on the inputs' device",
             )
         elif "unsupported scalarType" not in str(error):  # torch.autocast does not know the device "meta"
-            reason = said(error)[:100]
-            notes.append(f"it looks at values ({reason} …), so a GPU is waited for, and no CUDA graph can hold it")
+            text = f"it looks at values ({said(error)[:100]} …), so a GPU is waited for, and no CUDA graph can hold it"
+            notes.append(text)
+            if getattr(getattr(owner, switch), "sync_free", False):
+                yield "device", f"{text}; expected sync_free = False"
         return
     if wrong := [name for name, x in out.items() if x.device.type != "meta"]:
         yield "device", f"{wrong[0]} is on the CPU: {text}"
