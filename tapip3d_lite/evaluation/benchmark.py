@@ -69,7 +69,7 @@ def run_benchmark(
 
 
 def version_of(tracker: object, options: Mapping[str, object]) -> str:
-    """A short digest of everything that scores depend on: the benchmark's clips, a tracker's settings, own parts, weights, options."""
+    """A short digest of all that scores depend on: the benchmark's clips, a tracker's settings, code, weights, options."""
     digest = hashlib.sha256()
     for split in ALL:
         digest.update(split_file(split).read_bytes())

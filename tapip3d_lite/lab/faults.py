@@ -22,13 +22,13 @@ from tapip3d_lite.training.loss import LossConfig, Truth
 
 Faults = Iterator[tuple[str, str]]
 _HIDDEN = (
-    "the memory-saving backward misses gradients; expected tensors with gradient in Level.features, in Level.extra (lists, "
-    "tuples, dicts), or in what describe returns (a tensor, or an object with map)"
+    "the memory-saving backward misses gradients; expected tensors with gradient in Level.features, in Level.extra "
+    "(lists, tuples, dicts), or in what describe returns (a tensor, or an object with map)"
 )
 
 
 def examine(probe: Probe, switch: str, config: TrackerConfig, faults: dict[str, str], notes: list[str]) -> None:
-    """Add the faults of a part, the first of each kind, and notes; where outputs have wrong shapes, nothing else is tried."""
+    """Add the faults of a part, the first of each kind, and notes; outputs of wrong shapes are not looked at further."""
 
     def add(found: Faults) -> None:
         for kind, text in found:

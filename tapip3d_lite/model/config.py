@@ -161,7 +161,7 @@ class TrackerConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any], parts: Sequence[Any] = ()) -> TrackerConfig:
-        """The inverse of `to_dict`, given the custom `parts` that it may name (see `load_tracker`); ValueError names others, and unknown fields."""
+        """The inverse of `to_dict`; ValueError names unknown fields, and classes not among `parts` (see `load_tracker`)."""
         unknown = sorted(set(values) - {field.name for field in fields(cls)})
         if unknown:
             raise ValueError(f"TrackerConfig: unknown fields {', '.join(unknown)}; the file is from another version")

@@ -49,26 +49,19 @@ FAST: dict[tuple[str, str], str] = {
 CUDA_STEP = "tapip3d_lite.speed.cuda_graph:CudaGraphStep"
 
 
-class Function(nn.Module):
-    """A plain function as a module, so that hooks see it like any other part."""
+class Function(Context):
+    """A plain function as a module, so that hooks see it like any other part.
+
+    As a context it says its `width` by an attribute, and its `kept` are the support's features.
+    """
 
     def __init__(self, function: Any) -> None:
         super().__init__()
-        self.function = function
+        self.function, self.width = function, getattr(function, "width", None)
 
     def forward(self, *args: Any) -> Any:
         """Call it."""
         return self.function(*args)
-
-
-class FunctionContext(Context, Function):
-    """A function of (index, kept, near) as a context; `kept` are the support's features, its attribute `width` counts."""
-
-    def __init__(self, function: Any) -> None:
-        super().__init__(function)
-        self.width = getattr(function, "width", None)
-
-    forward = Function.forward
 
 
 def make_space(choice: Any) -> Any:
@@ -91,8 +84,7 @@ def make_module(switch: str, config: TrackerConfig, *sizes: int, fast: bool = Tr
     """
     found = _look_up(switch, getattr(config, switch), fast)
     part = make_part(switch, found, **dict(zip(("config", "inputs"), (config, *sizes), strict=False)))
-    if not isinstance(part, nn.Module):
-        part = FunctionContext(part) if switch == "context" else Function(part)
+    part = part if isinstance(part, nn.Module) else Function(part)
     if switch == "context" and not (hasattr(part, "describe") and isinstance(getattr(part, "width", None), int)):
         raise ValueError(
             f"context: expected a `model.n2n.Context` that sets self.width, or a function with an attribute width, the "
@@ -104,7 +96,7 @@ def make_module(switch: str, config: TrackerConfig, *sizes: int, fast: bool = Tr
 def fast_step(device: str, custom: Sequence[Any] = ()) -> Any:
     """What runs a training step faster on a device: on a GPU a CUDA graph, else None.
 
-    A graph can hold no part that waits for the GPU. Of `custom` parts it is believed of those that say `sync_free = True`.
+    A graph can hold no part that waits for the GPU: of `custom` parts only those that say `sync_free = True`.
     """
     if torch.device(device).type != "cuda":
         return None

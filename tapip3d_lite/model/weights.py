@@ -2,7 +2,8 @@
 
     file = {parameter name: tensor},  header = {"format": "tapip3d_lite", "config": TrackerConfig as JSON}
 
-Such a file can hold no code, and what it names of a caller's own parts is imported only if the caller allows it. The authors' checkpoints are read by `official.load_official`.
+Such a file holds no code, and classes that its config names are imported only where the caller allows it. The authors'
+checkpoints are read by `official.load_official`.
 """
 
 from __future__ import annotations

@@ -220,7 +220,7 @@ class Trainer:
         self.tracker.requires_grad_(not matching)
         self.tracker.encoder.requires_grad_(matching or self.config.train_encoder)
         self.parameters = [p for p in self.tracker.parameters() if p.requires_grad]
-        fast = fast_step(self.device, self.config.custom)
+        fast = None if matching else fast_step(self.device, self.config.custom)
         self._replay = None if fast is None else fast(self._add_gradients, self.tracker, self.parameters)
         self.optimizer = adamw(self.parameters, recipe.lr, recipe.weight_decay, fused=self._on_gpu)
         if saved is not None:
