@@ -447,7 +447,7 @@ def test_the_readmes_part_keeps_the_contract(folder):
         if "MyContext(Context)" in block
     )
     (folder / "my_parts.py").write_text(code)
-    assert str(lab.check_part("my_parts:MyContext")) == "MyContext (context): keeps the contract"
+    assert str(lab.check_part("my_parts:MyContext")) == "my_parts:MyContext (context): keeps the contract"
 
 
 def test_part_names():
