@@ -81,6 +81,8 @@ class Trainer:
         clips = check_clips(clips, config)  # before there is a folder
         self.config, self.validate, self.device, self.workers = config, validate, device, workers
         self._loss = make_part("TrainConfig.loss", config.loss)
+        if isinstance(self._loss, nn.Module):
+            self._loss.to(device)
         self.folder = RunFolder(folder, config, resume)
         with torch.random.fork_rng():  # leaves the caller's random generator as it is
             torch.manual_seed(config.seed)
