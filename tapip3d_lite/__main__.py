@@ -6,6 +6,7 @@ Bad input ends with one line on standard error and exit code 2; Ctrl-C with exit
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,6 +30,7 @@ from tapip3d_lite.trackers import tracker_runs
 from tapip3d_lite.training.recipe import TrainConfig
 
 Format = Annotated[str, arg(help="of the clip, if it is not recognised: " + ", ".join(FORMATS[1:]))]
+ALLOW = arg(help="modules that may be imported for the custom parts that a file names")
 
 
 def track(
@@ -43,13 +45,14 @@ def track(
     png: Annotated[Path | None, arg(help="picture of frames with tracks")] = None,
     grid: Annotated[int, arg(help="queries on the first frame, side x side, where the clip has none")] = 16,
     own_queries: Annotated[bool, arg(help="use the clip's own queries where it has some")] = True,
-    space: Annotated[str, arg(help="world or camera (learnt trackers)")] = "world",
+    space: Annotated[str | None, arg(help="world or camera; by default the learnt tracker's own")] = None,
     size: Annotated[tuple[int, int] | None, arg(help="height and width to look at (learnt trackers)")] = None,
     crop: Annotated[
         tuple[int, int, int, int] | None, arg(help="left, top, right, bottom to look at, in pixels")
     ] = None,
     steady: Annotated[bool, arg(help="first correct poses and depth scales that jitter")] = False,
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
+    allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
     """Track the points of a clip in 3D."""
     for path, allowed in (*((path, WRITERS) for path in out), (html, (".html",)), (png, (".png",))):
@@ -59,7 +62,7 @@ def track(
     queries = loaded.queries if own_queries and loaded.queries is not None else t3d.grid_queries(loaded, grid)
     given = replace(loaded, queries=queries)
     seen = t3d.steady_clip(given) if steady else given
-    result = t3d.load_tracker(tracker, device=device).track(seen, space=space, size=size, crop=crop)
+    result = t3d.load_tracker(tracker, device, parts=allow).track(seen, space=space, size=size, crop=crop)
     result = result if seen is given else t3d.carry(result, seen, given)
     shown = result.visible.mean() if result.visible.size else 0.0
     print(f"{clip}: {len(queries)} points over {len(loaded)} frames with {tracker}, {shown:.0%} visible")
@@ -82,11 +85,12 @@ def evaluate(
     tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("lite", "static", "klt"),
     format: Format = "auto",
     device: str = "cpu",
+    allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
     """Score trackers on clips with true tracks; prints a Markdown table, one row a clip, then the means."""
     rows, means = {}, {}
     for name in tracker:
-        loaded = t3d.load_tracker(name, device=device)
+        loaded = t3d.load_tracker(name, device, parts=allow)
         scores = {}
         for path in tqdm(clips, desc=name, leave=False, disable=None):
             clip = t3d.load_clip(path, format)
@@ -105,9 +109,10 @@ def benchmark(
     out: Annotated[Path | None, arg(help="JSON with every clip's scores; an interrupted run is continued")] = None,
     figure: Annotated[Path | None, arg(help="picture (PNG) of means with intervals")] = None,
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
+    allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
     """Score trackers on the Lite benchmark; prints Markdown tables with 95 % bootstrap intervals over clips."""
-    results = run_benchmark(tracker_runs(tracker, space, device), split, count, out)
+    results = run_benchmark(tracker_runs(tracker, space, device, allow), split, count, out)
     for part in ("", "_dynamic", "_static"):
         print(summary_table(results, tuple(metric + part for metric in METRICS), split) + "\n")
     if figure:
@@ -168,11 +173,17 @@ def train(
     device: Annotated[str, arg(help="cpu or cuda; several processes: torchrun -m tapip3d_lite train …")] = "cpu",
     workers: Annotated[int | None, arg(help="processes for examples; default: 0 on a CPU, else cores less two")] = None,
     compiled: Annotated[bool, arg(help="compile the tracker's parts, for a GPU: slow to start, then faster")] = False,
+    loss: Annotated[str | None, arg(help="paper, pixels, or your own: my_parts:MyLoss")] = None,
+    allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
     """Train a tracker on simulated clips, by default with the recipe of --preset (lite or paper); Ctrl-C saves and stops, --resume continues exactly there."""
     from tapip3d_lite.lab.train import train as run
 
-    finished, text = run(out, config, data, resume, device, workers, compiled)
+    if loss is not None and config.loss != TrainConfig.recipe(config.preset).loss:
+        raise ValueError("train: --loss takes the place of all --loss.… settings; give it or them")
+    if loss is not None:
+        config = replace(config, loss=loss)
+    finished, text = run(out, config, data, resume, device, workers, compiled, allow)
     print(text)
     if not finished:
         sys.exit(130)
@@ -188,9 +199,10 @@ def card(
     weights: Annotated[Path | None, arg(help="the file, if not the folder's own")] = None,
     command: Annotated[str | None, arg(help="that made it, shown beside the recipe")] = None,
     also: Annotated[Path | None, arg(help="Markdown file to put before the limits")] = None,
+    allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
     """Write the model card of a training folder and of results that `benchmark --out` wrote."""
-    write_text(out, model_card(folder, results, hardware, name, command, weights, also))
+    write_text(out, model_card(folder, results, hardware, name, command, weights, also, allow))
     print(f"wrote {out}")
 
 
@@ -230,6 +242,8 @@ def _train(arguments: list[str]) -> Callable[..., None]:
 
 def main() -> None:
     """Run one command; bad input ends with one line and exit code 2."""
+    if os.getcwd() not in sys.path:  # as `python -m` does; parts of the user's own are named "module:Class"
+        sys.path.append(os.getcwd())
     try:
         chosen = COMMANDS | {"train": _train(sys.argv[1:])}
         tyro.extras.subcommand_cli_from_dict(chosen, prog="tapip3d_lite", description=__doc__.splitlines()[0])

@@ -25,7 +25,8 @@ from tapip3d_lite.variants.p2n import P2N
 
 @dataclass
 class LevelRecord:
-    """What happened at one level; n chosen tracks, S frames. Attention is averaged over heads.
+    """What happened at one level; n chosen tracks, S frames. Attention is averaged over heads; only the contexts
+    `n2n` and `p2n` have it.
 
     Attributes:
         near: context neighbourhoods (S, n, K, ...), normalised coordinates; `indices` are cells of the frame.
@@ -122,13 +123,19 @@ class Recorder:
         near = _first(self.tracker.neighborhood(level, coords, level.cells(uv, scene.frames.size)))
         support = _first(window.support[index].pick(chosen))
         context = self.tracker.context
-        if isinstance(context, N2N):  # its clear form, whichever one the tracker computes with
+        if _computes_as(context, N2N):  # its clear form, whichever one the tracker computes with
             found = _look_at_n2n(context, index, N2N.describe(context, index, support), near)
-        elif isinstance(context, P2N):
+        elif _computes_as(context, P2N):
             found = _look_at_p2n(context, index, context.describe(index, support), near)
         else:
             found = {}
         return LevelRecord(near, support, **found)
+
+
+def _computes_as(context: nn.Module, kind: type) -> bool:
+    """Whether a context is of this kind, and none of a user's that compares otherwise."""
+    own = type(context).forward is kind.forward or type(context).__module__.startswith("tapip3d_lite.")
+    return isinstance(context, kind) and own
 
 
 def _look_at_n2n(context: N2N, index: int, kept: Tensor, near: Neighbors) -> dict[str, Tensor]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from tapip3d_lite.evaluation.baselines import Baseline, KltTracker, StaticTracker, TrackerLike
 from tapip3d_lite.files import shipped_weights
+from tapip3d_lite.model.config import INTERCHANGEABLE
 
 _BASELINES = {"static": StaticTracker, "klt": KltTracker}
 
@@ -16,16 +18,20 @@ def list_trackers() -> list[str]:
     return sorted(shipped_weights()) + list(_BASELINES)
 
 
-def load_tracker(name: str | Path = "lite", device: str = "cpu", fast: bool = True) -> TrackerLike:
+def load_tracker(
+    name: str | Path = "lite", device: str = "cpu", fast: bool = True, parts: Sequence[Any] = ()
+) -> TrackerLike:
     """A tracker by name, or from a weights file.
 
     Args:
         name: one of `list_trackers()`, or the path of a `.safetensors` file.
         device: where a learnt tracker computes, `"cpu"` or `"cuda"`.
         fast: compute by the fast forms of a learnt tracker's parts; False: by the clear ones, for the same numbers.
+        parts: custom parts that the file may name: classes, e.g. `[MyContext]`, matched by name; or names of modules
+            that may be imported for it. A file alone never imports code.
 
     Raises:
-        ValueError: neither a known name nor a file.
+        ValueError: neither a known name nor a file, or a file with a custom part that is not among `parts`.
     """
     name = str(name)
     if name in _BASELINES:
@@ -35,14 +41,21 @@ def load_tracker(name: str | Path = "lite", device: str = "cpu", fast: bool = Tr
         raise ValueError(f"load_tracker: no tracker {name!r}; choose {', '.join(list_trackers())} or a weights file")
     from tapip3d_lite.model.weights import load_weights
 
-    return load_weights(path, device, fast)
+    return load_weights(path, device, fast, parts)
 
 
-def tracker_runs(names: Sequence[str], spaces: Sequence[str], device: str = "cpu") -> Iterator[tuple]:
-    """(label, tracker, options of `track`) of trackers by name: `klt`, and of learnt ones each space, `lite · world`."""
+def tracker_runs(
+    names: Sequence[str], spaces: Sequence[str], device: str = "cpu", parts: Sequence[Any] = ()
+) -> Iterator[tuple]:
+    """(label, tracker, options of `track`) of trackers by name: `klt`, and of learnt ones each space, `lite · world`.
+
+    A tracker that was made for another space than these runs in its own alone; `parts` as for `load_tracker`.
+    """
     for name in names:
-        tracker = load_tracker(name, device)
+        tracker, label = load_tracker(name, device, True, parts), Path(name).with_suffix("")
         if isinstance(tracker, Baseline):
             yield str(name), tracker, {}
+        elif tracker.config.space in INTERCHANGEABLE:
+            yield from ((f"{label} · {space}", tracker, {"space": space}) for space in spaces)
         else:
-            yield from ((f"{Path(name).with_suffix('')} · {space}", tracker, {"space": space}) for space in spaces)
+            yield f"{label} · {getattr(tracker.space, 'name', 'own space')}", tracker, {}

@@ -346,4 +346,5 @@ def test_config_round_trip_and_presets():
     with pytest.raises(ValueError, match="expected one of paper, lite"):
         TrackerConfig.preset("huge")
     with pytest.raises(ValueError, match="custom part"):
-        config.replace(context=N2N).to_dict()
+        config.replace(updater=lambda tokens, active=None: tokens).to_dict()
+    assert config.replace(context=N2N).to_dict()["context"] == "tapip3d_lite.model.n2n:N2N"

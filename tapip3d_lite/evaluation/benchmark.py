@@ -18,6 +18,7 @@ from tapip3d_lite.evaluation.evaluate import evaluate, markdown_table
 from tapip3d_lite.evaluation.intervals import Estimate, bootstrap_interval, paired_difference
 from tapip3d_lite.evaluation.lite_splits import ALL, COUNT, SPLITS, benchmark_clips, check_split, split_file
 from tapip3d_lite.files import write_text
+from tapip3d_lite.parts import source
 
 Results = dict[str, dict[str, dict[str, dict[str, float]]]]  # label → split → clip → metric → score
 METRICS = ("AJ3D_none", "APD3D_none", "AJ3D", "APD3D", "OA")
@@ -68,11 +69,13 @@ def run_benchmark(
 
 
 def version_of(tracker: object, options: Mapping[str, object]) -> str:
-    """A short digest of everything that scores depend on: the benchmark's clips, a tracker's settings, weights, options."""
+    """A short digest of all that scores depend on: the benchmark's clips, a tracker's settings, code, weights, options."""
     digest = hashlib.sha256()
     for split in ALL:
         digest.update(split_file(split).read_bytes())
     digest.update(f"{getattr(tracker, 'config', tracker)!r} {sorted(options.items())}".encode())
+    for part in getattr(getattr(tracker, "config", None), "custom", ()):
+        digest.update(source(part).encode())
     if hasattr(tracker, "state_dict"):
         for name, weights in tracker.state_dict().items():
             digest.update(name.encode() + weights.cpu().float().contiguous().numpy().tobytes())

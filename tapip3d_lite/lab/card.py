@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from tapip3d_lite.evaluation.benchmark import ALL, METRICS, difference_table, load_results, summary_table
 from tapip3d_lite.model.weights import load_weights
@@ -27,12 +29,14 @@ def model_card(
     command: str | None = None,
     weights: str | Path | None = None,
     also: str | Path | None = None,
+    parts: Sequence[Any] = (),
 ) -> str:
     """The model card of a finished training, in Markdown; ValueError where a file is missing, unreadable or empty.
 
     `folder` holds `config.json`, `log.jsonl` and the weights, unless these lie elsewhere (`weights`); `results` is what
     `benchmark --out` wrote, `also` a Markdown file to put before the limits. Files cannot know the `hardware`, nor a
     `command` that is to be shown beside the recipe.
+    Custom `parts` that they name must be given, as for `load_tracker`.
     """
     folder = Path(folder)
     path = Path(weights) if weights else folder / "weights.safetensors"
@@ -40,7 +44,7 @@ def model_card(
         raise ValueError(f"card: {folder} is not a finished training; it needs config.json, log.jsonl and {path.name}")
     if also and not Path(also).is_file():
         raise ValueError(f"card: no file {also}; --also takes Markdown, such as tests.robustness writes")
-    config = TrainConfig.from_dict(json.loads((folder / "config.json").read_text(encoding="utf-8")))
+    config = TrainConfig.from_dict(json.loads((folder / "config.json").read_text(encoding="utf-8")), parts)
     log, (scores, _) = read_log(folder), load_results(results)
     if not log or not scores:
         raise ValueError(
@@ -51,7 +55,7 @@ def model_card(
     scoring = f"python -m tapip3d_lite benchmark --tracker {trackers} --space world camera --out {Path(results).name}"
     parts = [
         f"# Model card: `{name}`",
-        _facts(config, log, path, hardware),
+        _facts(config, log, path, hardware, parts),
         "## Made by",
         "\n".join(["```", *([command] if command else []), scoring, "```"]),
         f"The recipe is that of the preset `{config.preset}`, with these values instead:",
@@ -78,8 +82,8 @@ def _differences(scores: dict, labels: list[str], name: str) -> list[str]:
     return ["Differences, paired by clip:", *tables]
 
 
-def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -> str:
-    tracker, last = load_weights(weights), log[-1]
+def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str, parts: Sequence[Any]) -> str:
+    tracker, last = load_weights(weights, parts=parts), log[-1]
     model, parameters = tracker.config, sum(p.numel() for p in tracker.parameters())
     rows = {
         "parameters": f"{parameters / 1e6:.2f} M, file {weights.stat().st_size / 1e6:.2f} MB",
@@ -93,7 +97,7 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str) -
         "wall-clock": f"{last['seconds'] / 3600:.2f} h of steps (evaluations and simulation not counted)",
         "hardware": hardware,
         "visible from": f"probability {model.visible_threshold:g}"
-        + (f" of being seen and within {config.loss.within:g} pixels" if config.loss.within else ""),
+        + (f" of being seen and within {within:g} pixels" if (within := getattr(config.loss, "within", 0)) else ""),
     }
     held_out = [line for line in log if "val_AJ3D_none" in line]
     if held_out:

@@ -72,10 +72,12 @@ def train(
     device: str,
     workers: int | None = None,
     compiled: bool = False,
+    allow: Sequence[str] = (),
 ) -> tuple[bool, str]:
     """Run one training in the folder `out`, with options as the command's; errors are a ValueError, as `Trainer`'s are.
 
-    With `resume` the folder's own recipe is used. Missing clips are simulated in `data`, by default `out / "clips"`. By
+    With `resume` the folder's own recipe is used; custom parts that it names must be allowed anew, by `config`, which
+    names them too, or by modules that may be imported (`allow`): a folder is trusted no more than weights are. Missing clips are simulated in `data`, by default `out / "clips"`. By
     default a CPU has no worker processes, since it needs its cores for the training itself.
 
     Returns:
@@ -87,7 +89,7 @@ def train(
         raise ValueError("train: only a GPU gains from compiling; add --device cuda, or leave --compiled out")
     recipe, data = out / "config.json", data or out / "clips"
     if resume and recipe.exists():
-        config = TrainConfig.from_dict(json.loads(recipe.read_text()))
+        config = TrainConfig.from_dict(json.loads(recipe.read_text()), [*allow, *config.custom])
     if workers is None:
         cores = (os.cpu_count() or 2) // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
         workers = 0 if device == "cpu" else max(1, cores - 2)

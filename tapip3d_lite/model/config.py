@@ -5,9 +5,11 @@ Paper: section 3.2 (the method) and the ablations, one field each. The defaults 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
+
+from tapip3d_lite.parts import allowed_parts, find_part, part_name
 
 CHOICES = {
     "space": ("uv", "uvd", "uvlogd", "camera", "world", "first"),
@@ -16,7 +18,8 @@ CHOICES = {
     "updater": ("transformer", "temporal"),
     "norm_mode": ("isotropic", "anisotropy", "none"),
 }
-_SWITCHES = ("space", "neighborhood", "context", "updater")
+SWITCHES = ("space", "neighborhood", "context", "updater")
+INTERCHANGEABLE = ("camera", "world", "first")  # spaces that one checkpoint serves
 _MAY_BE_ZERO = ("support_grid", "visible_threshold")
 
 Part = str | Callable[..., Any]
@@ -26,11 +29,15 @@ Part = str | Callable[..., Any]
 class TrackerConfig:
     """Sizes and switches of a tracker; frozen, so a checkpoint's config cannot drift from its weights.
 
+    Each of the first four is a built-in name, a class (which alone can be saved and loaded again), a module or function,
+    or `"module:Class"`, which is imported and stands for the class. `lab.check_part` tells whether a part of yours
+    keeps to its contract.
+
     Attributes:
-        space: where a trajectory lives; a name or a `spaces.Space`.
-        neighborhood: which cells a point looks at; a name or a callable (see `neighbors.KNearest`).
-        context: what it makes of them; a name or a `n2n.Context`, as a class or a module.
-        updater: how trajectories are corrected; a name or a module (see `updater.Transformer`), as a class or a module.
+        space: where a trajectory lives; see `spaces.Space`.
+        neighborhood: which cells a point looks at; see `neighbors.KNearest`.
+        context: what it makes of them; see `n2n.Context`.
+        updater: how trajectories are corrected; see `updater.Transformer`.
         image_size: (H, W) pixels that the tracker works at.
         as_released: resized clips get intrinsics up to |1 - W'/W| / 2 px beside the image, and logits alone make points
             visible, as in the released code.
@@ -107,9 +114,10 @@ class TrackerConfig:
         object.__setattr__(self, "image_size", tuple(int(side) for side in self.image_size))
         for name, allowed in CHOICES.items():
             value = getattr(self, name)
-            if value not in allowed if isinstance(value, str) else not (name in _SWITCHES and callable_part(value)):
-                own = ", or a custom part" if name in _SWITCHES else ""
-                raise ValueError(f"TrackerConfig.{name}: expected one of {', '.join(allowed)}{own}; got {value!r}")
+            if name in SWITCHES:
+                object.__setattr__(self, name, find_part(f"TrackerConfig.{name}", value, allowed))
+            elif value not in allowed:
+                raise ValueError(f"TrackerConfig.{name}: expected one of {', '.join(allowed)}; got {value!r}")
         for field in fields(self):
             value = getattr(self, field.name)
             if field.type in ("int", "float") and value <= 0 and field.name not in _MAY_BE_ZERO:
@@ -141,20 +149,23 @@ class TrackerConfig:
         height, width = self.image_size[0] // self.stride, self.image_size[1] // self.stride
         return [(height >> level, width >> level) for level in range(self.levels)]
 
+    @property
+    def custom(self) -> list[Any]:
+        """The parts that are not built in."""
+        return [part for name in SWITCHES if not isinstance(part := getattr(self, name), str)]
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for a weights file; ValueError where a custom part has no name to save."""
-        for name in _SWITCHES:
-            if not isinstance(getattr(self, name), str):
-                raise ValueError(f"TrackerConfig.{name} is a custom part and has no name; save its state_dict yourself")
-        return asdict(self) | {"image_size": list(self.image_size)}
+        """Plain values for a weights file, classes as `"module:Class"`; ValueError where a part has no name."""
+        parts = {name: part_name(getattr(self, name), f"TrackerConfig.{name}") for name in SWITCHES}
+        return asdict(self) | parts | {"image_size": list(self.image_size)}
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> TrackerConfig:
-        """The inverse of `to_dict`; ValueError names unknown fields."""
+    def from_dict(cls, values: dict[str, Any], parts: Sequence[Any] = ()) -> TrackerConfig:
+        """The inverse of `to_dict`; ValueError names unknown fields, and classes not among `parts` (see `load_tracker`)."""
         unknown = sorted(set(values) - {field.name for field in fields(cls)})
         if unknown:
             raise ValueError(f"TrackerConfig: unknown fields {', '.join(unknown)}; the file is from another version")
-        return cls(**values)
+        return cls(**(values | allowed_parts(values, SWITCHES, parts)))
 
     def replace(self, **changes: Any) -> TrackerConfig:
         """A copy with some fields changed, checked again."""
@@ -183,7 +194,8 @@ class TrackerConfig:
             raise ValueError(f"TrackerConfig.outputs: expected 4, or 5 with a confidence, got {self.outputs}")
 
     def _check_combination(self) -> None:
-        if (self.neighborhood == "planes") != (self.context == "planes") and isinstance(self.context, str):
+        own = not (isinstance(self.neighborhood, str) and isinstance(self.context, str))  # may fit anything
+        if (self.neighborhood == "planes") != (self.context == "planes") and not own:
             raise ValueError(
                 f"TrackerConfig: neighborhood {self.neighborhood!r} with context {self.context!r}: planes are read only by "
                 "the context 'planes', and it reads nothing else; set both or none"
@@ -195,7 +207,7 @@ class TrackerConfig:
                 "TrackerConfig: context 'correlation' compares cells place by place, and nearest neighbours have no places; "
                 "set neighborhood='window'"
             )
-        if self.depth_ratio and (self.context != "correlation" or self.space in ("uv", "world")):
+        if self.depth_ratio and (self.context in ("n2n", "p2n", "planes") or self.space in ("uv", "world")):
             raise ValueError(
                 "TrackerConfig.depth_ratio: only the context 'correlation' reads it, and only where the third axis is depth, "
                 "that is in the spaces 'uvd', 'uvlogd' and 'camera'"
@@ -204,11 +216,6 @@ class TrackerConfig:
             raise ValueError(
                 f"TrackerConfig.use_features: only the context 'n2n' appends the query's feature, not {self.context!r}"
             )
-
-
-def callable_part(part: Any) -> bool:
-    """Whether something can stand for a switch: a class, a module, a function, or a space with its methods."""
-    return callable(part) or all(hasattr(part, name) for name in ("lift", "from_world", "to_world", "to_pixels"))
 
 
 _PRESETS: dict[str, dict[str, Any]] = {

@@ -7,13 +7,15 @@ place that chooses between them.
 
 from __future__ import annotations
 
-from importlib import import_module
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import nn
 
 from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.n2n import Context
+from tapip3d_lite.parts import LOG, find_part, import_part, make_part
 
 PARTS: dict[str, dict[str, str]] = {
     "space": {
@@ -47,12 +49,15 @@ FAST: dict[tuple[str, str], str] = {
 CUDA_STEP = "tapip3d_lite.speed.cuda_graph:CudaGraphStep"
 
 
-class Function(nn.Module):
-    """A plain function as a module, so that hooks see it like any other part."""
+class Function(Context):
+    """A plain function as a module, so that hooks see it like any other part.
+
+    As a context it says its `width` by an attribute, and its `kept` are the support's features.
+    """
 
     def __init__(self, function: Any) -> None:
         super().__init__()
-        self.function = function
+        self.function, self.width = function, getattr(function, "width", None)
 
     def forward(self, *args: Any) -> Any:
         """Call it."""
@@ -60,9 +65,8 @@ class Function(nn.Module):
 
 
 def make_space(choice: Any) -> Any:
-    """The space behind a name, or a custom space as it is."""
-    found = _look_up("space", choice, fast=False)
-    return found() if isinstance(found, type) else found
+    """The space behind a name, an instance of a class, or a custom space as it is."""
+    return make_part("space", _look_up("space", choice, fast=False))
 
 
 def make_module(switch: str, config: TrackerConfig, *sizes: int, fast: bool = True) -> nn.Module:
@@ -72,32 +76,40 @@ def make_module(switch: str, config: TrackerConfig, *sizes: int, fast: bool = Tr
         switch: name of the config's field.
         config: names of built-in parts are looked up, classes are called with (config, *sizes), modules are used as
             they are, functions are wrapped.
-        sizes: what the part's constructor needs beside the config.
-        fast: the fast form of a built-in part, where there is one.
+        sizes: what the part's constructor needs beside the config: of an updater its number of inputs.
+        fast: the fast form of a built-in part, where there is one; a custom part runs as it is written.
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: an unknown name, a class with another constructor, or a context without a width.
     """
     found = _look_up(switch, getattr(config, switch), fast)
-    if isinstance(found, type):
-        return found(config, *sizes)
-    return found if isinstance(found, nn.Module) else Function(found)
+    part = make_part(switch, found, **dict(zip(("config", "inputs"), (config, *sizes), strict=False)))
+    part = part if isinstance(part, nn.Module) else Function(part)
+    if switch == "context" and not (hasattr(part, "describe") and isinstance(getattr(part, "width", None), int)):
+        raise ValueError(
+            f"context: expected a `model.n2n.Context` that sets self.width, or a function with an attribute width, the "
+            f"channels of its output; got {found!r}"
+        )
+    return part
 
 
-def fast_step(device: str) -> Any:
-    """What runs a training step faster on a device: on a GPU a CUDA graph, else None."""
-    return load_part(CUDA_STEP) if torch.device(device).type == "cuda" else None
+def fast_step(device: str, custom: Sequence[Any] = ()) -> Any:
+    """What runs a training step faster on a device: on a GPU a CUDA graph, else None.
 
-
-def load_part(path: str) -> Any:
-    """What `"module:name"` names; the module is imported."""
-    module, _, name = path.partition(":")
-    return getattr(import_module(module), name)
+    A graph can hold no part that waits for the GPU: of `custom` parts only those that say `sync_free = True`.
+    """
+    if torch.device(device).type != "cuda":
+        return None
+    if waiting := [str(getattr(part, "__name__", part)) for part in custom if not getattr(part, "sync_free", False)]:
+        LOG.warning("no CUDA graph, as %s may wait for the GPU; it says otherwise by sync_free = True", waiting[0])
+        return None
+    return import_part(CUDA_STEP)
 
 
 def _look_up(switch: str, choice: Any, fast: bool) -> Any:
-    if not isinstance(choice, str):
-        return choice
-    if choice not in PARTS[switch]:
-        raise ValueError(f"{switch}: expected one of {', '.join(PARTS[switch])} or a custom part, got {choice!r}")
-    return load_part(FAST.get((switch, choice), PARTS[switch][choice]) if fast else PARTS[switch][choice])
+    found = find_part(switch, choice, PARTS[switch])
+    if isinstance(found, str):
+        return import_part(FAST.get((switch, found), PARTS[switch][found]) if fast else PARTS[switch][found])
+    if fast:
+        LOG.info("%s: %s has no fast form and runs as it is written", switch, getattr(found, "__name__", found))
+    return found

@@ -22,12 +22,11 @@ from torch import Tensor, nn
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
-from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.config import INTERCHANGEABLE, TrackerConfig
 from tapip3d_lite.model.frames import Frames, crop_clip, frames_from_clip, resize_clip
 from tapip3d_lite.queries import grid_queries, resolve_queries
 
 _KEPT = 2**27  # floats of features kept for a whole clip (512 MiB); of longer clips only a window's are
-_INTERCHANGEABLE = ("camera", "world", "first")
 
 
 @torch.no_grad()
@@ -178,7 +177,7 @@ def _bar(show: bool, tracker: nn.Module, frames: int, iterations: int | None, pa
 def check_options(tracker: nn.Module, space: Any, roi: Any, threshold: float | None, grid: int) -> float:
     """The threshold of visibility; ValueError where an option of `track` cannot be honoured."""
     own = tracker.config.space
-    if space not in (None, own) and not (own in _INTERCHANGEABLE and space in _INTERCHANGEABLE):
+    if space not in (None, own) and not (own in INTERCHANGEABLE and space in INTERCHANGEABLE):
         raise ValueError(
             f"space: this tracker was made for {own!r}, got {space!r}; only camera, world and first are exchangeable"
         )

@@ -18,7 +18,7 @@ from torch import Tensor
 from tapip3d_lite.model.frames import Frames
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.windows import Step, Window
-from tapip3d_lite.training.loss import LossConfig, Truth, step_loss
+from tapip3d_lite.training.loss import Loss, Truth
 
 
 def add_gradients(
@@ -26,16 +26,17 @@ def add_gradients(
     frames: Frames,
     queries: Tensor,
     truth: Truth,
-    config: LossConfig,
+    loss: Loss,
     features: Tensor | None = None,
     watch: Callable[[Step], None] | None = None,
     **options: Any,
 ) -> Tensor:
     """Add the gradients of the whole loss to the parameters' gradients, one update at a time.
 
-    Queries (B, N, 4) are rows (t, x, y, z), world, and `truth` belongs to the same tracks. `features` (B, T, C, h, w) are
-    those of an encoder that is not trained along; without them the frames are encoded. `watch` is called with every
-    update before its tensors are freed; `options` are those of `Tracker.steps`, e.g. `active`, `iterations`, `space`.
+    Queries (B, N, 4) are rows (t, x, y, z), world, and `truth` belongs to the same tracks. `loss` is a `LossConfig` or
+    any callable like it. `features` (B, T, C, h, w) are those of an encoder that is not trained along; without them the
+    frames are encoded. `watch` is called with every update before its tensors are freed; `options` are those of
+    `Tracker.steps`, e.g. `active`, `iterations`, `space`.
     Returns the position and visibility parts (2,) of the loss, without gradient.
     """
     features = tracker.encoder(frames.rgb) if features is None else features
@@ -43,7 +44,7 @@ def add_gradients(
     leaf = whole.of(features)
     iterations, totals = options.get("iterations") or tracker.config.iterations, []
     for step in tracker.steps(frames, queries, features=leaf, on_window=window.shared, **options):
-        parts = step_loss(step, truth, iterations, config)
+        parts = loss(step, truth, iterations)
         sum(parts).backward()
         if step.iteration == iterations - 1:
             window.backward(retain_graph=True)  # the queries' neighbourhoods also serve the next window

@@ -4,11 +4,14 @@ Paper, equation (4): L = sum_m gamma^(M - m) [ sum (1/d) |x - x*| + alpha BCE(v,
 gamma = 0.8, alpha = 3. The released code takes means instead of sums, and multiplies the position term by the focal
 length, so that it is an error in pixels; the weight of visibility beside position is then smaller by that factor. Ours
 always takes means, over the frames from the query on. The options `soften` and `within` are ours, and off by default.
+
+A loss is any callable like `LossConfig`, with the contract of `LossConfig.__call__`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +21,8 @@ from torch import Tensor
 from tapip3d_lite.geometry import RASTER, THRESHOLDS, transform
 from tapip3d_lite.model.windows import Step
 from tapip3d_lite.validate import check_range
+
+FORMS = ("paper", "pixels")
 
 
 @dataclass(frozen=True)
@@ -62,11 +67,29 @@ class LossConfig:
     within: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.form not in ("paper", "pixels"):
+        if self.form not in FORMS:
             raise ValueError(f'LossConfig.form: expected "paper" or "pixels", got {self.form!r}')
         check_range(self, 0, math.inf, "visibility", "scale", "soften", "within")
         if not 0 < self.discount <= 1:
             raise ValueError(f"LossConfig.discount: expected a value in (0, 1], got {self.discount}")
+
+    def __call__(self, step: Step, truth: Truth, iterations: int) -> tuple[Tensor, Tensor]:
+        """The two terms of `step_loss`: what every loss is called for.
+
+        Args:
+            step: one update of one window, with gradient in `coords` (so in `xyz`) and `logits`.
+            truth: of all frames and tracks of the batch; `step.start` and `step.columns` say which are the window's.
+            iterations: M; `step.iteration` runs from 0 to M - 1.
+
+        Returns:
+            Terms of position and of visibility, two finite scalars whose sum is minimised, the mean of what each clip
+            has alone. Not counted are frames before the query and after the clip's end, inactive tracks, and positions
+            that are NaN. A class is called without arguments once; what it learnt itself would not be trained.
+        """
+        return step_loss(step, truth, iterations, self)
+
+
+Loss = Callable[[Step, Truth, int], tuple[Tensor, Tensor]]
 
 
 def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> tuple[Tensor, Tensor]:

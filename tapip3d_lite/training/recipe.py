@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import Any
 
-from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.config import SWITCHES, TrackerConfig
+from tapip3d_lite.parts import allowed_parts, find_part, part_name
 from tapip3d_lite.training.augment import AugmentConfig
 from tapip3d_lite.training.data import SamplingConfig
-from tapip3d_lite.training.loss import LossConfig
+from tapip3d_lite.training.loss import FORMS, LossConfig
 from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.pretrain import MatchingConfig
 from tapip3d_lite.validate import check_range
@@ -22,7 +24,8 @@ class TrainConfig:
 
     Attributes:
         preset: of the tracker, `"lite"` or `"paper"`.
-        tracker: fields of the preset to set differently, e.g. `{"context": "p2n"}`; `--tracker context p2n`.
+        tracker: fields of the preset to set differently, e.g. `{"context": "p2n"}` or `{"context": MyContext}`;
+            `--tracker context p2n` or `--tracker context my_parts:MyContext`.
         init: weights to start from, `"lite"` or a file, instead of a random initialisation; usually with
             `matching_steps=0`.
         clips: number of training clips; the stored features of one take 13 MB.
@@ -46,6 +49,8 @@ class TrainConfig:
         evaluate_every: steps between evaluations on held-out clips.
         validation: number of held-out clips.
         save_every: steps between checkpoints.
+        loss: a `LossConfig`, `"paper"` or `"pixels"`, or a callable like `LossConfig`: a class, a function or
+            `"module:name"`; `--loss.soften 2` or `--loss my_parts:MyLoss`.
         sensor: share of the examples whose depth (and image, where it is encoded anew) is that of a poor sensor.
         augment: apply `augmentation` to the images of both stages; needs `train_encoder`, since stored features cannot
             follow changed images.
@@ -86,6 +91,8 @@ class TrainConfig:
     augmentation: AugmentConfig = field(default_factory=AugmentConfig)
 
     def __post_init__(self) -> None:
+        loss = self.loss if isinstance(self.loss, LossConfig) else find_part("TrainConfig.loss", self.loss, FORMS)
+        object.__setattr__(self, "loss", LossConfig(form=loss) if isinstance(loss, str) else loss)
         for name in ("frames", "iterations"):
             value = getattr(self, name)  # lists come from JSON
             object.__setattr__(self, name, (value, value) if isinstance(value, int) else tuple(value))
@@ -148,15 +155,43 @@ class TrainConfig:
         """Steps of both stages; with a time budget, the number of its equal parts."""
         return self.matching_steps + self.steps
 
+    @property
+    def custom(self) -> list[Any]:
+        """The parts of the tracker that are not built in, and such a loss."""
+        return self.tracker_config().custom + ([] if type(self.loss) is LossConfig else [self.loss])
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, as they come back from JSON."""
-        return json.loads(json.dumps(asdict(self)))
+        """Plain values, as they come back from JSON, classes as `"module:Class"`; ValueError where one has no name."""
+        values = {
+            name: asdict(x) if is_dataclass(x) and not isinstance(x, type) else x for name, x in vars(self).items()
+        }
+        if type(self.loss) is not LossConfig:
+            values["loss"] = part_name(self.loss, "TrainConfig.loss")
+        tracker = {
+            name: part_name(x, f"TrainConfig.tracker[{name!r}]") for name, x in self.tracker.items() if name in SWITCHES
+        }
+        values["tracker"] = self.tracker | tracker
+        return json.loads(json.dumps(values))
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> TrainConfig:
-        """The inverse of `to_dict`; fields that an older file lacks get their defaults, unknown ones are a ValueError."""
-        parts = vars(cls())
-        unknown = set(values) - set(parts)
-        if unknown:
+    def complete(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """A stored recipe with the defaults of fields that an older file lacks; unknown ones are a ValueError."""
+        usual = cls()
+        if unknown := set(values) - set(vars(usual)):
             raise ValueError(f"TrainConfig: unknown {', '.join(sorted(unknown))}; was it written by another version?")
-        return cls(**{k: type(parts[k])(**v) if is_dataclass(parts[k]) else v for k, v in values.items()})
+        own = {name: asdict(type(x)()) for name, x in vars(usual).items() if is_dataclass(x)}
+        given = {name: own.get(name, {}) | x if isinstance(x, dict) else x for name, x in values.items()}
+        return usual.to_dict() | json.loads(json.dumps(given))
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any], parts: Sequence[Any] = ()) -> TrainConfig:
+        """The inverse of `to_dict`, with the custom `parts` that it may name, as for `load_tracker`; see `complete`."""
+        usual, values = vars(cls()), cls.complete(values)
+        values |= allowed_parts(values, ["loss"], parts)
+        values["tracker"] = values["tracker"] | allowed_parts(values["tracker"], SWITCHES, parts)
+        made = {
+            name: type(usual[name])(**x)
+            for name, x in values.items()
+            if is_dataclass(usual[name]) and isinstance(x, dict)
+        }
+        return cls(**(values | made))

@@ -36,7 +36,7 @@ class RunFolder:
             return
         if not resume:
             raise ValueError(f"train: {path} holds a training already; continue with --resume or choose another folder")
-        stored = TrainConfig.from_dict(json.loads(recipe.read_text())).to_dict()
+        stored = TrainConfig.complete(json.loads(recipe.read_text()))  # whose parts are not imported
         different = [f"{k}={stored[k]!r} (now {v!r})" for k, v in wanted.items() if stored[k] != v]
         if different:
             raise ValueError(f"train: {path} was begun with another recipe: {', '.join(different)}; use its own")

@@ -20,8 +20,9 @@ from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.registry import fast_step
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.model.weights import load_weights, save_weights
+from tapip3d_lite.model.weights import read_weights, save_weights
 from tapip3d_lite.model.windows import Step
+from tapip3d_lite.parts import make_part
 from tapip3d_lite.training.backward import add_gradients, losses
 from tapip3d_lite.training.data import Batch, FeatureCache
 from tapip3d_lite.training.examples import Examples, check_clips
@@ -79,11 +80,15 @@ class Trainer:
             raise ValueError(f"Trainer: workers must not be negative, got {workers}; 0 makes examples in this process")
         clips = check_clips(clips, config)  # before there is a folder
         self.config, self.validate, self.device, self.workers = config, validate, device, workers
+        self._loss = make_part("TrainConfig.loss", config.loss)
+        if isinstance(self._loss, nn.Module):
+            self._loss.to(device)
         self.folder = RunFolder(folder, config, resume)
         with torch.random.fork_rng():  # leaves the caller's random generator as it is
             torch.manual_seed(config.seed)
             self.tracker = Tracker(config.tracker_config()).to(device).train()
-            nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
+            if isinstance(head := getattr(self.tracker.updater, "head", None), nn.Linear):
+                nn.init.normal_(head.weight, std=config.head)
         if config.init is not None:
             _start_from(self.tracker, config.init)
         self.group, self.step, self.seconds = Group(device), 0, 0.0
@@ -205,7 +210,7 @@ class Trainer:
         options = {"iterations": iterations, "depth_roi": batch.roi, "features": batch.features, "watch": watch}
         example = batch.frames, batch.queries, batch.truth
         with self._precision():
-            return add_gradients(self.tracker, *example, self.config.loss, **options), seen
+            return add_gradients(self.tracker, *example, self._loss, **options), seen
 
     def _precision(self) -> torch.autocast:
         return torch.autocast(self.device, torch.bfloat16, enabled=self.config.precision == "bfloat16")
@@ -217,7 +222,7 @@ class Trainer:
         self.tracker.requires_grad_(not matching)
         self.tracker.encoder.requires_grad_(matching or self.config.train_encoder)
         self.parameters = [p for p in self.tracker.parameters() if p.requires_grad]
-        fast = fast_step(self.device)
+        fast = None if matching else fast_step(self.device, self.config.custom)
         self._replay = None if fast is None else fast(self._add_gradients, self.tracker, self.parameters)
         self.optimizer = adamw(self.parameters, recipe.lr, recipe.weight_decay, fused=self._on_gpu)
         if saved is not None:
@@ -234,7 +239,7 @@ class Trainer:
 def _start_from(tracker: Tracker, name: str) -> None:
     """Load weights, `"lite"` or a file, into a tracker; other sizes raise a ValueError that names one of them."""
     try:
-        tracker.load_state_dict(load_weights(shipped_weights().get(name, name)).state_dict())
+        tracker.load_state_dict(read_weights(shipped_weights().get(name, name))[0])
     except RuntimeError as error:
         raise ValueError(
             f"TrainConfig.init: {name!r} belongs to a tracker of other sizes: {str(error).splitlines()[-1].strip()}"
