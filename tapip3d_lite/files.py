@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+
+from tapip3d_lite.archive import Archive
+
+_HEAD = 2**14  # bytes in which an array's header must end
+_HEADER = re.compile(
+    rb"\{ *'descr': *'([<>|=]?[?biufcSUVMm]\d*(?:\[\w+\])?)', *'fortran_order': *(True|False), "
+    rb"*'shape': *\(((?:\d+, *)*\d*)\),? *\}\s*"
+)
 
 
 @contextmanager
@@ -41,27 +49,59 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def load_npz(path: str | Path, skip: Collection[str] = (), outline: Collection[str] = ()) -> dict[str, np.ndarray]:
-    """The arrays of an npz file without those to skip, only zeros for an `outline`; an unreadable file is a ValueError."""
+    """The arrays of an npz file without those to skip, only zeros for an `outline`; an unreadable file is a ValueError.
+
+    Memory is taken only for what the file's length and each array's header agree upon.
+    """
+    if not Path(path).is_file():
+        raise ValueError(f"{path}: no such file; check the path")
     try:
-        # An open file of our own: np.load leaks the one it opens when the zip turns out to be broken.
         with open(path, "rb") as file:
-            data = np.load(file, allow_pickle=False)
-            if not isinstance(data, np.lib.npyio.NpzFile):
-                raise ValueError("it holds one bare array, not named ones")
-            return {k: _outline(data, k) if k in outline else data[k] for k in data.files if k not in skip}
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; check the path") from None
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError) as error:
+            archive, arrays = Archive(file), {}
+            for member, size in archive.sizes.items():
+                key = member.removesuffix(".npy")
+                if key == member:
+                    raise ValueError(f"it holds {member}, which is no array")
+                if key not in skip:
+                    dtype, shape, order, start = _npy_header(archive.head(member, _HEAD), size)
+                    zeros = np.broadcast_to(np.zeros((), dtype), shape) if key in outline else None
+                    arrays[key] = _array(archive.read(member), dtype, shape, order, start) if zeros is None else zeros
+            return arrays
+    except (ValueError, TypeError, OSError, MemoryError) as error:
         raise ValueError(
             f"{path}: not a readable npz ({error}); it may be truncated, pickled or of another format"
         ) from error
 
 
-def _outline(data: np.lib.npyio.NpzFile, key: str) -> np.ndarray:
-    with data.zip.open(f"{key}.npy") as file:
-        major, minor = np.lib.format.read_magic(file)
-        shape, _, dtype = getattr(np.lib.format, f"read_array_header_{major}_{minor}")(file)
-    return np.broadcast_to(np.zeros((), dtype), shape)
+def map_npy(path: str | Path) -> np.ndarray:
+    """The array of an npy file, read from the disk where it is used; an unreadable file is a ValueError."""
+    try:
+        size = Path(path).stat().st_size
+        with open(path, "rb") as file:
+            dtype, shape, order, start = _npy_header(file.read(_HEAD), size)
+        return np.memmap(path, dtype, "r", start, shape, order)
+    except (ValueError, TypeError, OSError) as error:
+        raise ValueError(f"{path}: not a readable npy ({error}); delete it") from error
+
+
+def _npy_header(head: bytes, size: int) -> tuple[np.dtype, tuple[int, ...], str, int]:
+    """dtype, shape, order and start of the data of an npy file of `size` bytes, from its first ones."""
+    wide = 2 if head[6:7] == b"\1" else 4
+    start = 8 + wide + int.from_bytes(head[8 : 8 + wide], "little")
+    found = _HEADER.fullmatch(head[8 + wide : start]) if head[:6] == b"\x93NUMPY" else None
+    if found is None or start > len(head):
+        raise ValueError("an array without a header that is known, perhaps of objects")
+    dtype, shape = np.dtype(found[1].decode()), tuple(map(int, found[3].replace(b",", b" ").split()))
+    count = math.prod(shape)
+    if not dtype.itemsize or start + count * dtype.itemsize != size or math.prod(x or 1 for x in shape) > count + 2**24:
+        raise ValueError(f"an array of shape {shape} and {dtype} in {size} bytes")
+    return dtype, shape, "F" if found[2] == b"True" else "C", start
+
+
+def _array(data: bytearray, dtype: np.dtype, shape: tuple[int, ...], order: str, start: int) -> np.ndarray:
+    array = np.frombuffer(data, dtype, offset=start) if len(data) > start else np.empty(0, dtype)
+    array = array.view(np.uint8) != 0 if dtype.kind == "b" else array  # other bytes would be neither true nor false
+    return np.require(array.reshape(shape, order=order), requirements="A")
 
 
 def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray | None]) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from numbers import Integral, Real
+
 import numpy as np
 
 
@@ -73,3 +76,31 @@ def check_range(config: object, low: float, high: float, *names: str) -> None:
         if not (low <= np.min(value) and np.max(value) <= high):
             wanted = f"at least {low}" if high == np.inf else f"values in [{low}, {high}]"
             raise ValueError(f"{type(config).__name__}.{name}: expected {wanted}, got {value}")
+
+
+_KINDS = {"int": Integral, "float": Real, "bool": bool | np.bool_, "str": str}
+
+
+def check_types(config: object) -> None:
+    """Raise ValueError unless a dataclass's numbers, switches and text are such, and finite; lists, of JSON, become tuples."""
+    for field in fields(config):
+        name, value, kinds = field.name, getattr(config, field.name), [field.type.removesuffix(" | None")]
+        if kinds[0].startswith("tuple["):
+            kinds, value = kinds[0][6:-1].split(", "), tuple(value) if isinstance(value, list) else value
+            object.__setattr__(config, name, value)
+        else:
+            value = (value,)
+        if (value == (None,) and field.type.endswith("| None")) or not set(kinds) <= set(_KINDS):
+            continue
+        if not isinstance(value, tuple) or len(value) != len(kinds) or not all(map(_fits, kinds, value)):
+            got = repr(getattr(config, name))
+            raise ValueError(f"{type(config).__name__}.{name}: expected {field.type}, got {got[:80]}")
+
+
+def _fits(kind: str, value: object) -> bool:
+    switch = isinstance(value, _KINDS["bool"])
+    return (
+        isinstance(value, _KINDS[kind])
+        and switch == (kind == "bool")
+        and (kind in ("bool", "str") or abs(value) < 1e300)
+    )

@@ -204,7 +204,7 @@ def bad_files(folder):
         ("absent.npz", "no such file"),
         ("rgb_only.npz", "depths, intrinsics, extrinsics missing"),
         ("scalar.npz", "Clip.video"),
-        ("foreign.npz", "missing"),
+        ("foreign.npz", "readme.txt, which is no array"),
         ("halftracks.npz", "visible, query_point missing"),
     ],
 )

@@ -8,10 +8,15 @@ Such a file can hold no code. The authors' checkpoints are read by `official.loa
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import safetensors.torch
+import torch
 from safetensors import SafetensorError, safe_open
+from torch.overrides import TorchFunctionMode
 
 from tapip3d_lite.files import atomic_path
 from tapip3d_lite.model.config import TrackerConfig
@@ -26,10 +31,11 @@ def save_weights(tracker: Tracker, path: str | Path, half: bool = False) -> None
     With `half` floats are stored in 16 bits, which halves the file; they are read back as 32-bit ones.
 
     Raises:
-        ValueError: the tracker has a custom part, which no file can name.
+        ValueError: the tracker has a custom part, which no file can name, or parameters that are not finite.
     """
     config = json.dumps(tracker.config.to_dict())
     state = {name: (x.half() if half else x).contiguous() for name, x in tracker.state_dict().items()}
+    check_state(state, state)
     with atomic_path(path) as temporary:
         safetensors.torch.save_file(state, temporary, metadata={"format": _FORMAT, "config": config})
 
@@ -38,7 +44,7 @@ def load_weights(path: str | Path, device: str = "cpu", fast: bool = True) -> Tr
     """Read a tracker that `save_weights` wrote, in evaluation mode, to a device; `fast` as for `Tracker`.
 
     Raises:
-        ValueError: missing, truncated or foreign file, or parameters that do not fit the config.
+        ValueError: missing, truncated or foreign file, parameters that do not fit the config or are not finite.
     """
     if not Path(path).is_file():
         raise ValueError(f"{path}: no such file; check the path")
@@ -52,9 +58,49 @@ def load_weights(path: str | Path, device: str = "cpu", fast: bool = True) -> Tr
         ) from error
     if metadata.get("format") != _FORMAT:
         raise ValueError(f"{path}: safetensors without a {_FORMAT} config; it belongs to another program")
-    tracker = Tracker(TrackerConfig.from_dict(json.loads(metadata["config"])), fast)
     try:
-        tracker.load_state_dict(state)
-    except RuntimeError as error:
-        raise ValueError(f"{path}: parameters do not fit the config: {str(error).splitlines()[-1].strip()}") from error
+        config = TrackerConfig.from_dict(json.loads(metadata["config"]))
+        check_state(state, outline(config).state_dict())
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    tracker = Tracker(config, fast)
+    tracker.load_state_dict(state)
     return tracker.to(device).eval()
+
+
+def check_state(state: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
+    """Raise ValueError unless parameters have the names and shapes wanted, and finite values."""
+    missing, unknown = sorted(set(wanted) - set(state)), sorted(set(state) - set(wanted))
+    if missing or unknown:
+        named = (", ".join(names[:9]) + ", …" * (len(names) > 9) or "none" for names in (missing, unknown))
+        raise ValueError(
+            "parameters do not fit the config: missing parameters: {}; unknown parameters: {}".format(*named)
+        )
+    for name, value in state.items():
+        if value.shape != wanted[name].shape:
+            shapes = f"expected shape {tuple(wanted[name].shape)}, got {tuple(value.shape)}"
+            raise ValueError(f"parameters do not fit the config: {name}: {shapes}")
+        if not value.float().isfinite().all():
+            raise ValueError(
+                f"parameter {name} is not finite: its training failed, or the file is damaged; use another one"
+            )
+
+
+def outline(config: TrackerConfig) -> Tracker:
+    """A tracker whose parameters have shapes but take no memory, so that a foreign file can be compared first."""
+    with _NoValues():
+        return Tracker(config, fast=False)
+
+
+class _NoValues(TorchFunctionMode):
+    """Makes parameters without values; `torch.device("meta")` alone would compute shapes of products for seconds."""
+
+    def __torch_function__(self, function: Callable, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        """Call a function of torch, unless it gives a parameter its first values."""
+        name, kwargs = function.__name__, kwargs or {}
+        if function in (torch.empty, torch.randn):
+            return torch.empty(*args, **(kwargs | {"device": "meta"}))
+        first = args[0] if args else next(iter(kwargs.values()), None)
+        if (name == "mul" or re.fullmatch("[a-z].*_", name)) and isinstance(first, torch.Tensor) and first.is_meta:
+            return first
+        return function(*args, **kwargs)

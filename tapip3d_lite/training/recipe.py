@@ -13,7 +13,7 @@ from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.pretrain import MatchingConfig
-from tapip3d_lite.validate import check_range
+from tapip3d_lite.validate import check_range, check_types
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,14 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for name in ("frames", "iterations"):
-            value = getattr(self, name)  # lists come from JSON
-            object.__setattr__(self, name, (value, value) if isinstance(value, int) else tuple(value))
-            if len(getattr(self, name)) != 2 or not 1 <= getattr(self, name)[0] <= getattr(self, name)[1]:
-                raise ValueError(f"TrainConfig.{name}: expected (fewest, most), both at least 1, got {value}")
+            value = getattr(self, name)
+            object.__setattr__(self, name, (value, value) if isinstance(value, int) else value)
+        check_types(self)
+        for name in ("frames", "iterations"):
+            if not 1 <= getattr(self, name)[0] <= getattr(self, name)[1]:
+                raise ValueError(
+                    f"TrainConfig.{name}: expected (fewest, most), both at least 1, got {getattr(self, name)}"
+                )
         check_range(self, 1, math.inf, "clips", "steps", "batch", "evaluate_every", "save_every")
         check_range(self, 0, math.inf, "matching_steps", "validation", "average")
         check_range(self, 0, 1, "short", "sensor")

@@ -15,8 +15,10 @@ import torch
 from tqdm.auto import tqdm
 
 from tapip3d_lite.files import atomic_path, write_text
+from tapip3d_lite.saved import read_saved
 from tapip3d_lite.training.recipe import TrainConfig
 
+_SAVED = ("model", "optimizer", "step", "position", "seconds")
 _SMOOTH = 0.98  # of the running means that the bar shows
 
 
@@ -41,10 +43,13 @@ class RunFolder:
         if different:
             raise ValueError(f"train: {path} was begun with another recipe: {', '.join(different)}; use its own")
 
-    def checkpoint(self, device: str) -> dict[str, Any] | None:
-        """Load the newest checkpoint, if there is one, and cut the log back to it."""
-        exists = self._checkpoint.exists()
-        saved = torch.load(self._checkpoint, map_location=device, weights_only=True) if exists else None
+    def checkpoint(self) -> dict[str, Any] | None:
+        """Load the newest checkpoint, if there is one, and cut the log back to it; ValueError if it is damaged."""
+        saved = read_saved(self._checkpoint) if self._checkpoint.exists() else None
+        if saved is not None and not (isinstance(saved, dict) and {*_SAVED} <= saved.keys()):
+            raise ValueError(
+                f"{self._checkpoint}: no checkpoint of a training, which has {', '.join(_SAVED)}; delete it"
+            )
         if self._log.exists():
             kept = [line for line in read_log(self._log) if saved is not None and line["step"] <= saved["step"]]
             write_text(self._log, "".join(json.dumps(line) + "\n" for line in kept))
@@ -61,13 +66,13 @@ class RunFolder:
             file.write(json.dumps(line) + "\n")
 
     def save_failure(self, line: dict[str, Any], norm: float, drawn: dict[str, Any]) -> str:
-        """Save the batch of a step whose loss or gradient is not finite; returns the message for the user."""
+        """Save the batch of a step whose loss, gradient or weights are not finite; returns the message for the user."""
         path = self.path / f"not_finite_{line['step']}.pt"
         with atomic_path(path) as temporary:
             torch.save({"line": line, "norm": norm, **drawn}, temporary)
         return (
-            f"train: loss {line['loss']} and gradient norm {norm} in step {line['step']} are not finite; the weights are "
-            f"unchanged. Its batch is in {path}, the last checkpoint in {self._checkpoint}; lower the learning rate"
+            f"train: loss {line['loss']} and gradient norm {norm} in step {line['step']} are not finite, or make the "
+            f"weights so. Its batch is in {path}, the last checkpoint in {self._checkpoint}; lower the learning rate"
         )
 
 

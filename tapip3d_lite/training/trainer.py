@@ -93,7 +93,7 @@ class Trainer:
             cache = FeatureCache(self.folder.path / "features", self.tracker.encoder, size)
             cache.check_room(clips)
         self.examples = Examples(config, clips, self.group.rank, cache)
-        saved = self.folder.checkpoint(device)
+        saved = self.folder.checkpoint()
         if saved is not None:
             self.tracker.load_state_dict(saved["model"])
             self.step, self.seconds = saved["step"], saved["seconds"]
@@ -110,7 +110,7 @@ class Trainer:
         """Train until the end, or until `stop()` is true after a step; either way everything is saved.
 
         Returns whether the training is finished. `progress` shows a bar with loss, accuracy, speed and remaining time. If
-        the loss or a gradient is not finite, the batch is saved in the folder, and a FloatingPointError raised.
+        the loss, a gradient or a weight is not finite, the batch is saved in the folder, and a FloatingPointError raised.
         """
         with Bar(self.schedule.position, self.config.total, progress and self.group.is_main) as bar:
             for line in self.steps(stop):
@@ -160,6 +160,8 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group |= {"lr": lr, "betas": (beta1, group["betas"][1])}
         self.optimizer.step()
+        if not np.isfinite(float(nn.utils.get_total_norm([p.detach() for p in self.parameters]))):
+            raise FloatingPointError(self.folder.save_failure(line, norm, self._drawn))
         self.step += 1
         self._add_to_average()
         self.seconds += time.perf_counter() - started
