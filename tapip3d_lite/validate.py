@@ -21,10 +21,17 @@ def video_frames(video: np.ndarray) -> np.ndarray:
 
 
 def check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
-    """Raise ValueError unless focal lengths (T, 3, 3) are positive and poses (T, 4, 4) rigid."""
+    """Raise ValueError unless intrinsics (T, 3, 3) are [fx s cx; 0 fy cy; 0 0 1], fx and fy > 0, and poses (T, 4, 4) rigid."""
     focal = intrinsics[:, [0, 1], [0, 1]]
     if not (focal > 0).all():
         raise ValueError(f"Clip.intrinsics: fx and fy must be positive, got {focal[(focal <= 0).any(-1)][0].tolist()}")
+    error = np.abs(intrinsics[:, [1, 2, 2, 2], [0, 0, 1, 2]] - (0, 0, 0, 1))
+    wrong = (error > 1e-4 * np.maximum((focal.max(), 0, 0, 0), 1)).any(-1)
+    if wrong.any():
+        raise ValueError(
+            f"Clip.intrinsics: expected rows [fx s cx], [0 fy cy], [0 0 1], got {intrinsics[wrong][0].tolist()} in frame "
+            f"{int(wrong.argmax())}; transpose it, or divide it by its last number"
+        )
     rotation = extrinsics[:, :3, :3]
     error = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
     mirrored = np.linalg.det(rotation) < 0
