@@ -6,6 +6,7 @@ import math
 import os
 import re
 import tempfile
+import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from tapip3d_lite.archive import Archive
+
+try:
+    import fcntl
+except ImportError:  # Windows, where nothing is locked
+    fcntl = None
 
 _HEAD = 2**14  # bytes in which an array's header must end
 _HEADER = re.compile(
@@ -25,9 +31,12 @@ _HEADER = re.compile(
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it onto `path` on success, delete it on any error.
 
-    The parent folder is made when missing.
+    The parent folder is made when missing. A link is written through, and a file that is there keeps its permissions; what
+    is no regular file is a ValueError.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: expected the name of a file, but this is a folder or a device; name another")
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
     os.close(handle)
@@ -36,10 +45,39 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # mkstemp makes it private; a result should be as readable as any file
+        mode = path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~umask  # mkstemp makes it private
+        temporary.chmod(mode)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(path: str | Path, what: str) -> Iterator[None]:
+    """Hold a lock file while the block runs; ValueError that says `what` is in use if another process does.
+
+    It holds the owner's number. The system releases it however a process ends, so one that is left over locks nothing.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a+") as file:
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not (path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())):
+                raise BlockingIOError  # its owner has just removed it
+        except BlockingIOError:
+            file.seek(0)
+            raise ValueError(
+                f"{what} is in use by process {file.read(20) or 'unknown'} ({path}); wait for it, or choose another folder"
+            ) from None
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -106,8 +144,11 @@ def _array(data: bytearray, dtype: np.dtype, shape: tuple[int, ...], order: str,
 
 def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray | None]) -> None:
     """Write a compressed npz atomically, without what is None."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **{key: value for key, value in arrays.items() if value is not None})
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        for key, value in arrays.items():
+            if value is not None:
+                with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array(member, np.asanyarray(value), allow_pickle=False)
 
 
 def shipped_weights() -> dict[str, Path]:

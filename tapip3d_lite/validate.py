@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import fields
 from numbers import Integral, Real
 
@@ -41,6 +42,17 @@ def check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
             f"Clip.extrinsics: frame {frame} is not a rigid world-to-camera motion (R R^T differs from I by {error[frame]:.2g}, "
             f"det R = {np.linalg.det(rotation[frame]):.2g}, last row {extrinsics[frame, 3].tolist()}); remove scale, use row-major [R|t; 0 0 0 1]"
         )
+
+
+def check_extras(extras: Mapping[str, np.ndarray], taken: Collection[str]) -> None:
+    """Raise ValueError unless a clip's further arrays have names and values that its file can hold."""
+    for key, value in extras.items():
+        if not isinstance(key, str) or not key.isprintable() or key in {*taken, "", "file", "allow_pickle"}:
+            raise ValueError(
+                f"Clip.extras: expected text that is no key of a clip's file as a name, got {key!r}; rename it"
+            )
+        if (dtype := np.asarray(value).dtype).kind not in "biufcSUmM" or not dtype.itemsize:
+            raise ValueError(f"Clip.extras: {key!r}: expected numbers or text, got dtype {dtype}; convert or drop it")
 
 
 def floats(name: str, value: object, shape: tuple[int | None, ...], finite: bool = False, like: str = "") -> np.ndarray:

@@ -421,3 +421,65 @@ def test_mutants_are_read_or_refused(tmp_path):
             except ValueError:
                 refused += 1
     assert refused > 700
+
+
+def test_one_nan_in_a_weights_file_is_refused(tmp_path):
+    tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **SIZES))
+    t3d.save_weights(tracker, tmp_path / "good")
+    state = tracker.state_dict() | {
+        "encoder.head.bias": torch.full_like(tracker.state_dict()["encoder.head.bias"], torch.nan)
+    }
+    config = json.dumps(tracker.config.to_dict())
+    save_file(state, tmp_path / "bad", {"format": "tapip3d_lite", "config": config})
+    with pytest.raises(ValueError, match=r"encoder\.head\.bias is not finite"):
+        t3d.load_tracker(tmp_path / "bad")
+    with torch.no_grad():
+        tracker.encoder.head.bias[0] = 1e5  # more than 16 bits hold
+    t3d.save_weights(tracker, tmp_path / "large")
+    with pytest.raises(ValueError, match="not finite"):
+        t3d.save_weights(tracker, tmp_path / "half", half=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad", "good", "large"]
+
+
+def a_clip(**changes):
+    depths = np.ones((3, 8, 8))
+    eye = np.tile(np.eye(4), (3, 1, 1))
+    return t3d.Clip(np.zeros((3, 8, 8, 3), np.uint8), depths, eye[:, :3, :3] + 0.0, eye, **changes)
+
+
+@pytest.mark.parametrize(
+    ("extras", "message"),
+    [
+        ({"file": np.zeros(3)}, "no key of a clip's file as a name, got 'file'"),
+        ({"allow_pickle": np.array(True)}, "got 'allow_pickle'"),
+        ({"video": np.zeros(3)}, "got 'video'"),
+        ({"fps": np.zeros(3)}, "got 'fps'"),
+        ({5: np.zeros(3)}, "got 5"),
+        ({"a\0b": np.zeros(3)}, "got 'a"),
+        ({"": np.zeros(3)}, "got ''"),
+        ({"a": np.array([None])}, "'a': expected numbers or text, got dtype object"),
+        ({"a": {"b": 1}}, "got dtype object"),
+        ({"a": np.zeros(2, [("x", "f4"), ("y", "O")])}, "expected numbers or text"),
+    ],
+)
+def test_extras_that_no_file_can_hold(extras, message):
+    with pytest.raises(ValueError, match=message):
+        a_clip(extras=extras)
+
+
+def test_extras_come_back(tmp_path):
+    extras = {
+        "text": np.array("né"),
+        "empty": np.zeros((0, 3)),
+        "flags": np.array([True]),
+        "a/b": np.arange(3),
+        "c": [1.5, 2],
+    }
+    a_clip(extras=extras, name="").save(tmp_path / "c.npz")
+    again = t3d.load_clip(tmp_path / "c.npz")
+    assert again.name == "" and again.extras.keys() == extras.keys()
+    assert all(np.array_equal(again.extras[key], extras[key]) for key in extras)
+    with pytest.raises(ValueError, match=r"Clip\.name"):
+        a_clip(name=None)
+    with pytest.raises(ValueError, match=r"Clip\.fps"):
+        a_clip(fps="12")

@@ -36,8 +36,12 @@ def save_weights(tracker: Tracker, path: str | Path, half: bool = False) -> None
     config = json.dumps(tracker.config.to_dict())
     state = {name: (x.half() if half else x).contiguous() for name, x in tracker.state_dict().items()}
     check_state(state, state)
+    data = safetensors.torch.save(state, metadata={"format": _FORMAT, "config": config})
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.dumps(json.loads(data[8:end]), sort_keys=True)  # else in random order: same weights, same bytes
+    header += " " * (-len(header) % 8)
     with atomic_path(path) as temporary:
-        safetensors.torch.save_file(state, temporary, metadata={"format": _FORMAT, "config": config})
+        temporary.write_bytes(len(header).to_bytes(8, "little") + header.encode() + data[end:])
 
 
 def load_weights(path: str | Path, device: str = "cpu", fast: bool = True) -> Tracker:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, field, is_dataclass
+from pathlib import Path
 from typing import Any
 
 from tapip3d_lite.model.config import TrackerConfig
@@ -96,14 +97,17 @@ class TrainConfig:
                     f"TrainConfig.{name}: expected (fewest, most), both at least 1, got {getattr(self, name)}"
                 )
         check_range(self, 1, math.inf, "clips", "steps", "batch", "evaluate_every", "save_every")
-        check_range(self, 0, math.inf, "matching_steps", "validation", "average")
+        check_range(self, 0, math.inf, "matching_steps", "validation", "average", "weight_decay", "head")
+        check_range(self, 0, 2**63, "seed")
         check_range(self, 0, 1, "short", "sensor")
         if self.minutes is not None and self.minutes <= 0:
             raise ValueError(f"TrainConfig.minutes: expected a positive time or None, got {self.minutes}")
         if self.precision not in ("float32", "bfloat16"):
             raise ValueError(f'TrainConfig.precision: expected "float32" or "bfloat16", got {self.precision!r}')
-        if self.lr <= 0 or not 0 < self.warmup < 1:
-            raise ValueError(f"TrainConfig: lr must be positive, warmup in (0, 1), got {self.lr} and {self.warmup}")
+        check_range(self, 1e-12, 1e3, "lr")
+        check_range(self, 1e-12, math.inf, "clip_norm")
+        if not 0 < self.warmup < 1:
+            raise ValueError(f"TrainConfig.warmup: expected a value in (0, 1), got {self.warmup}")
         if self.augment and not self.train_encoder:
             raise ValueError(
                 "TrainConfig.augment: features of a frozen encoder are stored in files and cannot follow changed images; "
@@ -164,3 +168,11 @@ class TrainConfig:
         if unknown:
             raise ValueError(f"TrainConfig: unknown {', '.join(sorted(unknown))}; was it written by another version?")
         return cls(**{k: type(parts[k])(**v) if is_dataclass(parts[k]) else v for k, v in values.items()})
+
+    @classmethod
+    def read(cls, path: str | Path) -> TrainConfig:
+        """The recipe in a training's `config.json`; an unreadable or damaged file is a ValueError."""
+        try:
+            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(f"{path}: not a readable recipe ({error}); choose another folder") from error

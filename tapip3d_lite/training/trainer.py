@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.registry import fast_step
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.model.weights import load_weights, save_weights
+from tapip3d_lite.model.weights import check_state, load_weights, outline, save_weights
 from tapip3d_lite.model.windows import Step
 from tapip3d_lite.training.backward import add_gradients, losses
 from tapip3d_lite.training.data import Batch, FeatureCache
@@ -79,13 +80,13 @@ class Trainer:
             raise ValueError(f"Trainer: workers must not be negative, got {workers}; 0 makes examples in this process")
         clips = check_clips(clips, config)  # before there is a folder
         self.config, self.validate, self.device, self.workers = config, validate, device, workers
-        self.folder = RunFolder(folder, config, resume)
         with torch.random.fork_rng():  # leaves the caller's random generator as it is
             torch.manual_seed(config.seed)
             self.tracker = Tracker(config.tracker_config()).to(device).train()
             nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
         if config.init is not None:
-            _start_from(self.tracker, config.init)
+            self.tracker.load_state_dict(initial_weights(config))
+        self.folder = RunFolder(folder, config, resume)
         self.group, self.step, self.seconds = Group(device), 0, 0.0
         self._on_gpu, cache = torch.device(device).type == "cuda", None
         if not config.train_encoder and not self._on_gpu:
@@ -93,8 +94,10 @@ class Trainer:
             cache = FeatureCache(self.folder.path / "features", self.tracker.encoder, size)
             cache.check_room(clips)
         self.examples = Examples(config, clips, self.group.rank, cache)
-        saved = self.folder.checkpoint()
+        with self.folder.locked() if self.group.is_main else nullcontext():
+            saved = self.folder.checkpoint(repair=self.group.is_main)
         if saved is not None:
+            check_state(saved["model"], self.tracker.state_dict())
             self.tracker.load_state_dict(saved["model"])
             self.step, self.seconds = saved["step"], saved["seconds"]
         self.schedule = Schedule(config, self.group, 0 if saved is None else saved["position"])
@@ -122,6 +125,10 @@ class Trainer:
 
         When the caller asks for the next step and `stop()` is true, everything is saved instead.
         """
+        with self.folder.locked() if self.group.is_main else nullcontext():
+            yield from self._steps(stop)
+
+    def _steps(self, stop: Callable[[], bool]) -> Iterator[dict]:
         self.schedule.start_clock()
         halted = False
         while not self.schedule.finished and not halted:
@@ -233,14 +240,14 @@ class Trainer:
         return scores
 
 
-def _start_from(tracker: Tracker, name: str) -> None:
-    """Load weights, `"lite"` or a file, into a tracker; other sizes raise a ValueError that names one of them."""
+def initial_weights(config: TrainConfig) -> dict[str, Tensor]:
+    """The weights that a recipe's `init` names; a ValueError if they are not readable or of other sizes."""
+    state = load_weights(shipped_weights().get(config.init, config.init)).state_dict()
     try:
-        tracker.load_state_dict(load_weights(shipped_weights().get(name, name)).state_dict())
-    except RuntimeError as error:
-        raise ValueError(
-            f"TrainConfig.init: {name!r} belongs to a tracker of other sizes: {str(error).splitlines()[-1].strip()}"
-        ) from error
+        check_state(state, outline(config.tracker_config()).state_dict())
+    except ValueError as error:
+        raise ValueError(f"TrainConfig.init: {config.init!r} belongs to a tracker of other sizes: {error}") from None
+    return state
 
 
 def _compile(tracker: Tracker) -> None:
