@@ -51,22 +51,18 @@ class Archive:
             raise ValueError("bytes that belong to no member")
         self.sizes = {name: member.numbers[2] for name, member in self._members.items()}
         if (total := sum(self.sizes.values())) > _ROOM + _RATIO * self.length:
-            raise ValueError(
-                f"{total / 1e9:.1f} GB in a file of {self.length / 1e6:.2f} MB, more than data can be packed"
-            )
+            raise ValueError(f"{total / 1e9:.1f} GB in {self.length / 1e6:.2f} MB, more than data can be packed")
 
     def read(self, name: str) -> bytearray:
-        """A member's bytes; ValueError unless they fit its size and checksum."""
+        """A member's bytes; ValueError or zlib.error unless they fit its size and checksum."""
         member, place = self._members[name], 0
-        data = bytearray(member.numbers[2])
+        data = memoryview(bytearray(member.numbers[2]))
         for part in self._parts(member):
-            if place + len(part) > len(data):
-                break
-            data[place : place + len(part)] = part
+            data[place : place + len(part)] = part  # refuses more than there is room for
             place += len(part)
         if place != len(data) or zlib.crc32(data) != member.numbers[0]:
             raise ValueError(f"{name} does not fit its size and checksum")
-        return data
+        return data.obj
 
     def head(self, name: str, count: int) -> bytes:
         """A member's first bytes, at most `count`."""
@@ -79,10 +75,7 @@ class Archive:
             if member.method == _STORED:
                 yield part
             while member.method == _DEFLATED and (part or more) and not unpack.unused_data:
-                try:
-                    unpacked = unpack.decompress(part, most)
-                except zlib.error as error:
-                    raise ValueError(str(error)) from None
+                unpacked = unpack.decompress(part, most)
                 part, more = unpack.unconsumed_tail, len(unpacked) == most
                 yield unpacked
         if member.method == _DEFLATED and (unpack.unused_data or not unpack.eof):
@@ -121,15 +114,13 @@ class Archive:
         size, stored = _large(own[names:], size, stored)
         if (kind, flags, method, own[:names]) != (b"PK\3\4", member.flags, member.method, name.encode()):
             raise ValueError(f"{name!r} has another header in the directory")
-        end, numbers = start + member.numbers[1], [member.numbers]
-        if flags & _LATE:
-            after = [x for x in _SIZES_AFTER if x.unpack(self._bytes(end, x.size)) == (b"PK\7\x08", *member.numbers)]
-            if not after:
-                raise ValueError(f"{name!r} has other sizes in the directory")
-            end, numbers = end + after[0].size, [member.numbers, (0, 0, 0)]
-        if (crc, stored, size) not in numbers:
+        end, after, late = start + member.numbers[1], [0], flags & _LATE
+        if late:
+            wanted = (b"PK\7\x08", *member.numbers)
+            after = [x.size for x in _SIZES_AFTER if x.unpack(self._bytes(end, x.size)) == wanted]
+        if not after or (crc, stored, size) not in (member.numbers, (0, 0, 0) if late else None):
             raise ValueError(f"{name!r} has other sizes in the directory")
-        return member._replace(start=start), end
+        return member._replace(start=start), end + after[0]
 
 
 _TOP = 0xFFFFFFFF  # stands for a number that is too large for its place
@@ -137,17 +128,14 @@ _TOP = 0xFFFFFFFF  # stands for a number that is too large for its place
 
 def _entry(directory: bytes, at: int) -> tuple[str, _Member, int]:
     """Name and member of the directory's entry at a place, with the start of its header; and the place of the next."""
-    if at + _CENTRAL.size > len(directory):
-        raise ValueError("a directory of fewer members than it says")
-    fields = _CENTRAL.unpack_from(directory, at)
+    fields = _CENTRAL.unpack_from(directory.ljust(at + _CENTRAL.size), at)
     kind, _, _, flags, method, _, _, crc, stored, size, names, extra, comment, disk, _, _, start = fields
     at += _CENTRAL.size
     name, further = directory[at : at + names].decode(), directory[at + names : at + names + extra]
     size, stored, start = _large(further, size, stored, start)
-    if kind != b"PK\1\2" or disk or comment or flags & ~_FLAGS or method not in (_STORED, _DEFLATED):
+    packed = method == _DEFLATED or (method == _STORED and stored == size)
+    if kind != b"PK\1\2" or disk or comment or flags & ~_FLAGS or not packed:
         raise ValueError(f"{name!r} is packed in a way that is not read; save it with numpy or torch")
-    if method == _STORED and stored != size:
-        raise ValueError(f"{name!r} has two sizes")
     return name, _Member(flags, method, (crc, stored, size), start), at + names + extra
 
 

@@ -7,6 +7,7 @@ import os
 import re
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -105,7 +106,7 @@ def load_npz(path: str | Path, skip: Collection[str] = (), outline: Collection[s
                     zeros = np.broadcast_to(np.zeros((), dtype), shape) if key in outline else None
                     arrays[key] = _array(archive.read(member), dtype, shape, order, start) if zeros is None else zeros
             return arrays
-    except (ValueError, TypeError, OSError, MemoryError) as error:
+    except (ValueError, TypeError, OSError, MemoryError, zlib.error) as error:
         raise ValueError(
             f"{path}: not a readable npz ({error}); it may be truncated, pickled or of another format"
         ) from error

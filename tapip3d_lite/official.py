@@ -16,7 +16,8 @@ from tapip3d_lite.checkpoint_reader import read_checkpoint
 from tapip3d_lite.model.blocks import time_embedding
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.model.weights import check_state, outline
+from tapip3d_lite.model.weights import outline
+from tapip3d_lite.validate import check_state
 
 # Their key -> our field, and the released value, for a stored configuration names only what differs from the code's
 # defaults. None: it must be there, since no parameter's shape would show a wrong guess.
@@ -103,9 +104,10 @@ def from_official_state(cfg: Mapping[str, Any], state: Mapping[str, Tensor], fas
 
 def official_config(cfg: Mapping[str, Any]) -> TrackerConfig:
     """Translate the authors' configuration; ValueError names options that cannot be honoured."""
-    if "model" not in cfg:
-        raise ValueError(f"cfg: expected a key 'model', got {', '.join(map(str, cfg)) or 'an empty mapping'}")
-    flat = {k: v for k, v in _flatten(cfg["model"]).items() if k not in _IGNORED}
+    model = cfg.get("model") if isinstance(cfg, Mapping) else None
+    if not isinstance(model, Mapping):
+        raise ValueError(f"cfg: expected a mapping with a mapping 'model', got {str(cfg)[:200]}")
+    flat = {k: v for k, v in _flatten(model).items() if k not in _IGNORED}
     for key, allowed in _REQUIRED.items():
         value = flat.pop(key, allowed[0])
         if value not in allowed:
@@ -118,9 +120,9 @@ def official_config(cfg: Mapping[str, Any]) -> TrackerConfig:
         ours[field] = value
     if flat:
         raise ValueError(f"cfg.model: unknown options {', '.join(sorted(flat))}; they might change the numbers")
-    size = cfg["model"].get("image_size") or cfg.get("train_dataset", {}).get("resolution") or (384, 512)
+    size = model.get("image_size") or _flatten(cfg).get("train_dataset.resolution") or (384, 512)
     # The released updater's heads are 48 wide, whatever its width.
-    return TrackerConfig(image_size=tuple(size), as_released=True, space="world", head_dim=48, **ours)
+    return TrackerConfig(image_size=size, as_released=True, space="world", head_dim=48, **ours)
 
 
 def parameter_names(tracker: Tracker) -> dict[str, str]:

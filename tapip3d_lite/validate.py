@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import fields
 from numbers import Integral, Real
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def video_frames(video: np.ndarray) -> np.ndarray:
@@ -123,3 +127,21 @@ def _fits(kind: str, value: object) -> bool:
         and switch == (kind == "bool")
         and (kind in ("bool", "str") or abs(value) < 1e300)
     )
+
+
+def check_state(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
+    """Raise ValueError unless parameters have the names and shapes wanted, and finite values."""
+    missing, unknown = sorted(set(wanted) - set(state)), sorted(set(state) - set(wanted))
+    if missing or unknown:
+        named = (", ".join(names[:9]) + ", …" * (len(names) > 9) or "none" for names in (missing, unknown))
+        raise ValueError(
+            "parameters do not fit the config: missing parameters: {}; unknown parameters: {}".format(*named)
+        )
+    for name, value in state.items():
+        if value.shape != wanted[name].shape:
+            shapes = f"expected shape {tuple(wanted[name].shape)}, got {tuple(value.shape)}"
+            raise ValueError(f"parameters do not fit the config: {name}: {shapes}")
+        if not value.float().isfinite().all():
+            raise ValueError(
+                f"parameter {name} is not finite: its training failed, or the file is damaged; use another one"
+            )

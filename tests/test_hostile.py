@@ -283,6 +283,27 @@ def test_configurations_that_grow(tmp_path, alone, cfg):
 
 
 @pytest.mark.parametrize(
+    "cfg",
+    [
+        5,
+        {},
+        {"model": 5},
+        {"model": {"image_size": 5}},
+        {"model": {}, "train_dataset": 5},
+        {"model": {"encoder": {"stride": "4"}}},
+        {"model": {"point_updater": {"hidden_size": 10**9}}},
+        {"model": {"name": ["x"]}},
+        {"model": {"seq_len": {"a": 1}}},
+    ],
+    ids=str,
+)
+def test_configurations_of_other_types(tmp_path, alone, cfg):
+    torch.save({"cfg": cfg, "weight": {"a": torch.zeros(1)}}, tmp_path / "x.pth")
+    with pytest.raises(ValueError, match=r"cfg|TrackerConfig|state"):
+        t3d.load_official(tmp_path / "x.pth")
+
+
+@pytest.mark.parametrize(
     "change",
     [
         {"hidden": 8192, "time_depth": 64, "space_depth": 64},
@@ -325,7 +346,7 @@ def test_npz_bombs(tmp_path, alone, monkeypatch):
     assert not load_npz(tmp_path / "x.npz")["a"].any()
     bomb = deflated(3 * 10**7)
     (tmp_path / "x.npz").write_bytes(bomb)
-    with within(3), pytest.raises(ValueError, match=r"0\.0 GB in a file of 0\.03 MB"):
+    with within(3), pytest.raises(ValueError, match=r"0\.0 GB in 0\.03 MB"):
         load_npz(tmp_path / "x.npz")
     start, _ = directory(bomb)  # says that it is small, in both places
     small = struct.pack("<I", 1000)

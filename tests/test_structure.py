@@ -18,7 +18,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # A module may import from its own floor and from floors below, never above. Rooms on one floor are apart, unless the
 # later one of a floor's list uses the earlier ones.
 FLOORS = [
-    ["geometry", "archive", "files", "validate"],
+    ["geometry", "archive", "files", "validate", "outline"],
     ["clip", "queries"],
     ["check", "simulate", "model"],
     ["variants", "speed"],

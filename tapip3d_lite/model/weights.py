@@ -8,19 +8,16 @@ Such a file can hold no code. The authors' checkpoints are read by `official.loa
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import safetensors.torch
-import torch
 from safetensors import SafetensorError, safe_open
-from torch.overrides import TorchFunctionMode
 
 from tapip3d_lite.files import atomic_path
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.tracker import Tracker
+from tapip3d_lite.outline import NoValues
+from tapip3d_lite.validate import check_state
 
 _FORMAT = "tapip3d_lite"
 
@@ -72,39 +69,7 @@ def load_weights(path: str | Path, device: str = "cpu", fast: bool = True) -> Tr
     return tracker.to(device).eval()
 
 
-def check_state(state: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
-    """Raise ValueError unless parameters have the names and shapes wanted, and finite values."""
-    missing, unknown = sorted(set(wanted) - set(state)), sorted(set(state) - set(wanted))
-    if missing or unknown:
-        named = (", ".join(names[:9]) + ", …" * (len(names) > 9) or "none" for names in (missing, unknown))
-        raise ValueError(
-            "parameters do not fit the config: missing parameters: {}; unknown parameters: {}".format(*named)
-        )
-    for name, value in state.items():
-        if value.shape != wanted[name].shape:
-            shapes = f"expected shape {tuple(wanted[name].shape)}, got {tuple(value.shape)}"
-            raise ValueError(f"parameters do not fit the config: {name}: {shapes}")
-        if not value.float().isfinite().all():
-            raise ValueError(
-                f"parameter {name} is not finite: its training failed, or the file is damaged; use another one"
-            )
-
-
 def outline(config: TrackerConfig) -> Tracker:
     """A tracker whose parameters have shapes but take no memory, so that a foreign file can be compared first."""
-    with _NoValues():
+    with NoValues():
         return Tracker(config, fast=False)
-
-
-class _NoValues(TorchFunctionMode):
-    """Makes parameters without values; `torch.device("meta")` alone would compute shapes of products for seconds."""
-
-    def __torch_function__(self, function: Callable, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
-        """Call a function of torch, unless it gives a parameter its first values."""
-        name, kwargs = function.__name__, kwargs or {}
-        if function in (torch.empty, torch.randn):
-            return torch.empty(*args, **(kwargs | {"device": "meta"}))
-        first = args[0] if args else next(iter(kwargs.values()), None)
-        if (name == "mul" or re.fullmatch("[a-z].*_", name)) and isinstance(first, torch.Tensor) and first.is_meta:
-            return first
-        return function(*args, **kwargs)

@@ -21,7 +21,7 @@ from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.registry import fast_step
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.model.weights import check_state, load_weights, outline, save_weights
+from tapip3d_lite.model.weights import load_weights, outline, save_weights
 from tapip3d_lite.model.windows import Step
 from tapip3d_lite.training.backward import add_gradients, losses
 from tapip3d_lite.training.data import Batch, FeatureCache
@@ -32,6 +32,7 @@ from tapip3d_lite.training.pretrain import FramePair, matching_loss
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.run_folder import Bar, RunFolder
 from tapip3d_lite.training.schedule import Schedule, adamw
+from tapip3d_lite.validate import check_state
 
 
 class Trainer:
