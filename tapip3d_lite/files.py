@@ -21,7 +21,7 @@ try:
 except ImportError:  # Windows, where nothing is locked
     fcntl = None
 
-_HEAD = 2**14  # bytes in which an array's header must end
+_HEAD = 2**10  # bytes in which an array's header must end
 _HEADER = re.compile(
     rb"\{ *'descr': *'([<>|=]?[?biufcSUVMm]\d*(?:\[\w+\])?)', *'fortran_order': *(True|False), "
     rb"*'shape': *\(((?:\d+, *)*\d*)\),? *\}\s*"
@@ -92,9 +92,11 @@ def load_npz(path: str | Path, skip: Collection[str] = (), outline: Collection[s
 
     Memory is taken only for what the file's length and each array's header agree upon.
     """
-    if not Path(path).is_file():
+    if not Path(path).exists():
         raise ValueError(f"{path}: no such file; check the path")
     try:
+        if not Path(path).is_file():
+            raise ValueError("a folder or a device")
         with open(path, "rb") as file:
             archive, arrays = Archive(file), {}
             for member, size in archive.sizes.items():

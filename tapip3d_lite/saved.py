@@ -20,29 +20,15 @@ from torch import Tensor
 
 from tapip3d_lite.archive import Archive
 
-_TYPES = {
-    "bool",
-    "bytes",
-    "complex",
-    "dict",
-    "float",
-    "frozenset",
-    "int",
-    "list",
-    "long",
-    "set",
-    "slice",
-    "str",
-    "tuple",
-}
+_TYPES = "bool bytes complex dict float frozenset int list long set slice str tuple"
 _STORAGES = {"CharStorage": torch.int8, "ByteStorage": torch.uint8}
 _STORAGES |= {f"{x}Storage": getattr(torch, x.lower()) for x in ("Double", "Float", "Half", "BFloat16", "Long", "Int")}
 _STORAGES |= {"ShortStorage": torch.int16, "BoolStorage": torch.bool}
 _DTYPES = {str(x)[6:] for x in vars(torch).values() if isinstance(x, torch.dtype)}
 _ARRAYS = {"scalar", "_reconstruct"}
 _KNOWN = {
-    "builtins": _TYPES,
-    "__builtin__": _TYPES,  # of Python 2
+    "builtins": _TYPES.split(),
+    "__builtin__": _TYPES.split(),  # of Python 2
     "collections": {"OrderedDict", "defaultdict"},
     "torch": {"Size", "device", *_DTYPES, *_STORAGES},
     "torch._utils": {"_rebuild_tensor", "_rebuild_tensor_v2", "_rebuild_parameter"},
