@@ -25,7 +25,7 @@ from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert, point_map, project, unproject
 
 _GAIN = 0.4  # a fix must leave at most this share of the error, once for each change that it makes
-_NOISE = 0.001  # exact clips stay well below; a mistake that changes less than this does no harm either
+NOISE = 0.001  # exact clips stay well below; a mistake that changes less than this does no harm either
 _CAP = 0.25  # relative depth errors above this count as this: the point is simply lost
 
 
@@ -101,7 +101,7 @@ def _wrong_intrinsics(clip: Clip) -> list[Finding]:
 def _motion_prefers(clip: Clip, fixed: Clip, otherwise: bool) -> bool:
     """Whether static-scene consistency supports the fix; `otherwise` where it supports neither."""
     before, after = consistency(clip), consistency(fixed)
-    if max(before, after) < 0.1 * _NOISE or min(before, after) > _GAIN * max(before, after):
+    if max(before, after) < 0.1 * NOISE or min(before, after) > _GAIN * max(before, after):
         return otherwise
     return after < before
 
@@ -160,7 +160,7 @@ _UNITS = [], ["depth_in_millimetres"], ["poses_in_millimetres"]
 def _wrong_motion(clip: Clip) -> list[Finding]:
     """The simplest set of pose and unit fixes that makes an inconsistent static scene consistent."""
     before = consistency(clip)
-    if before < _NOISE:
+    if before < NOISE:
         return []
     scored = []
     for pose, unit in product(_POSES, _UNITS):

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
 
 from tapip3d_lite.files import load_npz, save_npz
 from tapip3d_lite.geometry import point_map, project
-from tapip3d_lite.validate import bools, check_cameras, floats, video_frames
+from tapip3d_lite.validate import bools, check_cameras, check_extras, floats, video_frames
 
 _CLIP_KEYS = ("video", "depths", "intrinsics", "extrinsics")
 _OWN_KEYS = (*_CLIP_KEYS, "query_point", "tracks", "visible", "dynamic", "name", "fps")
@@ -119,8 +120,11 @@ class Clip:
             raise ValueError(
                 f"Clip.tracks: expected {frames} frames as in the video, got {len(self.tracks.xyz)}; cut both alike"
             )
-        if not (np.isfinite(self.fps) and self.fps > 0):
-            raise ValueError(f"Clip.fps: expected a positive number, got {self.fps}")
+        if not (isinstance(self.fps, Real) and np.isfinite(self.fps) and self.fps > 0):
+            raise ValueError(f"Clip.fps: expected a positive number, got {self.fps!r}")
+        if not isinstance(self.name, str):
+            raise ValueError(f"Clip.name: expected text, got {self.name!r}")
+        check_extras(self.extras, _OWN_KEYS)
 
     def __len__(self) -> int:
         return len(self.video)
@@ -190,7 +194,7 @@ def load_own_clip(path: str | Path, points: bool = True) -> Clip:
         queries=arrays.get("query_point") if points else None,
         tracks=tracks,
         name=str(arrays["name"]),
-        fps=float(arrays["fps"]),
+        fps=arrays["fps"].item() if arrays["fps"].size == 1 else arrays["fps"],
         extras={key: value for key, value in arrays.items() if key not in _OWN_KEYS},
     )
 

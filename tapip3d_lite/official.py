@@ -16,6 +16,8 @@ from tapip3d_lite.checkpoint_reader import read_checkpoint
 from tapip3d_lite.model.blocks import time_embedding
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.tracker import Tracker
+from tapip3d_lite.model.weights import outline
+from tapip3d_lite.validate import check_state
 
 # Their key -> our field, and the released value, for a stored configuration names only what differs from the code's
 # defaults. None: it must be there, since no parameter's shape would show a wrong guess.
@@ -88,24 +90,24 @@ def from_official_state(cfg: Mapping[str, Any], state: Mapping[str, Tensor], fas
     Raises:
         ValueError: options or parameters that are unknown, missing or of another shape, by name.
     """
-    tracker = Tracker(official_config(cfg), fast)
-    state = dict(state)
-    _check_time(tracker, state.pop("time_emb", None))
-    names, own = parameter_names(tracker), tracker.state_dict()
-    missing, unknown = sorted(set(names) - set(state)), sorted(set(state) - set(names))
-    if missing or unknown:
-        raise ValueError(
-            f"state: missing parameters: {', '.join(missing) or 'none'}; unknown parameters: {', '.join(unknown) or 'none'}"
-        )
-    tracker.load_state_dict({ours: _fit(theirs, state[theirs], own[ours]) for theirs, ours in names.items()})
+    config, state = official_config(cfg), dict(state)
+    plan = outline(config)
+    _check_time(plan, state.pop("time_emb", None))
+    names, own = parameter_names(plan), plan.state_dict()
+    if (virtual := state.get(_VIRTUAL)) is not None and virtual.ndim == 4:
+        state[_VIRTUAL] = virtual.transpose(1, 2)  # (1, V, 1, U) -> (1, 1, V, U)
+    check_state(state, {theirs: own[ours] for theirs, ours in names.items()})
+    tracker = Tracker(config, fast)
+    tracker.load_state_dict({ours: state[theirs].float() for theirs, ours in names.items()})
     return tracker.eval()
 
 
 def official_config(cfg: Mapping[str, Any]) -> TrackerConfig:
     """Translate the authors' configuration; ValueError names options that cannot be honoured."""
-    if "model" not in cfg:
-        raise ValueError(f"cfg: expected a key 'model', got {', '.join(map(str, cfg)) or 'an empty mapping'}")
-    flat = {k: v for k, v in _flatten(cfg["model"]).items() if k not in _IGNORED}
+    model = cfg.get("model") if isinstance(cfg, Mapping) else None
+    if not isinstance(model, Mapping):
+        raise ValueError(f"cfg: expected a mapping with a mapping 'model', got {str(cfg)[:200]}")
+    flat = {k: v for k, v in _flatten(model).items() if k not in _IGNORED}
     for key, allowed in _REQUIRED.items():
         value = flat.pop(key, allowed[0])
         if value not in allowed:
@@ -118,9 +120,9 @@ def official_config(cfg: Mapping[str, Any]) -> TrackerConfig:
         ours[field] = value
     if flat:
         raise ValueError(f"cfg.model: unknown options {', '.join(sorted(flat))}; they might change the numbers")
-    size = cfg["model"].get("image_size") or cfg.get("train_dataset", {}).get("resolution") or (384, 512)
+    size = model.get("image_size") or _flatten(cfg).get("train_dataset.resolution") or (384, 512)
     # The released updater's heads are 48 wide, whatever its width.
-    return TrackerConfig(image_size=tuple(size), as_released=True, space="world", head_dim=48, **ours)
+    return TrackerConfig(image_size=size, as_released=True, space="world", head_dim=48, **ours)
 
 
 def parameter_names(tracker: Tracker) -> dict[str, str]:
@@ -128,6 +130,7 @@ def parameter_names(tracker: Tracker) -> dict[str, str]:
     return {_their_name(name): name for name in tracker.state_dict()}
 
 
+_VIRTUAL = "point_updater.virual_tracks"
 _RENAMES = (  # our prefix -> theirs; the first that fits wins, then the rest of the name goes on
     ("encoder.stem.", "encoder.backbone.conv1."),
     ("encoder.fuse.", "encoder.backbone.conv2."),
@@ -137,7 +140,7 @@ _RENAMES = (  # our prefix -> theirs; the first that fits wins, then the rest of
     ("context.embed.offsets.", "corr_processor.posenc_mlps."),
     ("context.pairs.", "corr_processor.transformers."),
     ("updater.input.", "point_updater.input_transform."),
-    ("updater.virtual", "point_updater.virual_tracks"),
+    ("updater.virtual", _VIRTUAL),
     ("updater.time.", "point_updater.time_blocks."),
     ("updater.gather.", "point_updater.space_virtual2point_blocks."),
     ("updater.mix.", "point_updater.space_virtual_blocks."),
@@ -169,16 +172,6 @@ def _their_name(name: str) -> str:
         name = name.replace(ours, theirs)
     crosses = "xblock" in name or "2point_blocks" in name or "2virtual_blocks" in name
     return name.replace(".attention.", ".cross_attn." if crosses else ".attn.")
-
-
-def _fit(name: str, value: Tensor, own: Tensor) -> Tensor:
-    if name == "point_updater.virual_tracks":
-        value = value.transpose(1, 2) if value.ndim == 4 else value  # (1, V, 1, U) -> (1, 1, V, U)
-    if value.shape != own.shape:
-        raise ValueError(
-            f"state[{name!r}]: expected shape {tuple(own.shape)}, got {tuple(value.shape)}; cfg does not fit"
-        )
-    return value.float()
 
 
 def _check_time(tracker: Tracker, value: Tensor | None) -> None:

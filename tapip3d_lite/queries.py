@@ -40,14 +40,16 @@ def queries_from_pixels(clip: Clip, pixels: np.ndarray) -> np.ndarray:
 def grid_queries(clip: Clip, side: int = 16, frame: int = 0, margin: float = 1 / 64) -> np.ndarray:
     """A side x side grid of queries on one frame, without the nodes that fall on invalid depth.
 
-    The outermost nodes keep `margin` times the image width from every border, as in the released code's support grid.
+    The outermost nodes keep `margin` times the image width from every border, as in the released code's support grid;
+    in images less than twice as high they lie along the middle.
     Rows (t, x, y, z) are float32, in row-major order.
     """
     if side < 1 or not 0 <= frame < len(clip):
         raise ValueError(f"grid_queries: expected side >= 1, a frame in [0, {len(clip) - 1}], got {side=}, {frame=}")
     height, width = clip.size
-    inset = width * margin
-    u, v = np.meshgrid(np.linspace(inset, width - inset, side), np.linspace(inset, height - inset, side))
+    inset = [min(width * margin, (length - 1) / 2) for length in (width, height)]
+    u, v = (np.linspace(x, length - x, side) for x, length in zip(inset, (width, height), strict=True))
+    u, v = np.meshgrid(u, v)
     pixels = np.stack([np.full(u.size, frame), u.ravel(), v.ravel()], -1)
     pixels[:, 1:] = np.minimum(pixels[:, 1:], (width - 1, height - 1))
     nearest = np.rint(pixels[:, 1:]).astype(int)

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from dataclasses import fields
+from numbers import Integral, Real
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def video_frames(video: np.ndarray) -> np.ndarray:
@@ -18,10 +26,17 @@ def video_frames(video: np.ndarray) -> np.ndarray:
 
 
 def check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
-    """Raise ValueError unless focal lengths (T, 3, 3) are positive and poses (T, 4, 4) rigid."""
+    """Raise ValueError unless intrinsics (T, 3, 3) are [fx s cx; 0 fy cy; 0 0 1], fx and fy > 0, and poses (T, 4, 4) rigid."""
     focal = intrinsics[:, [0, 1], [0, 1]]
     if not (focal > 0).all():
         raise ValueError(f"Clip.intrinsics: fx and fy must be positive, got {focal[(focal <= 0).any(-1)][0].tolist()}")
+    error = np.abs(intrinsics[:, [1, 2, 2, 2], [0, 0, 1, 2]] - (0, 0, 0, 1))
+    wrong = (error > 1e-4 * np.maximum((focal.max(), 0, 0, 0), 1)).any(-1)
+    if wrong.any():
+        raise ValueError(
+            f"Clip.intrinsics: expected rows [fx s cx], [0 fy cy], [0 0 1], got {intrinsics[wrong][0].tolist()} in frame "
+            f"{int(wrong.argmax())}; transpose it, or divide it by its last number"
+        )
     rotation = extrinsics[:, :3, :3]
     error = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
     mirrored = np.linalg.det(rotation) < 0
@@ -31,6 +46,17 @@ def check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
             f"Clip.extrinsics: frame {frame} is not a rigid world-to-camera motion (R R^T differs from I by {error[frame]:.2g}, "
             f"det R = {np.linalg.det(rotation[frame]):.2g}, last row {extrinsics[frame, 3].tolist()}); remove scale, use row-major [R|t; 0 0 0 1]"
         )
+
+
+def check_extras(extras: Mapping[str, np.ndarray], taken: Collection[str]) -> None:
+    """Raise ValueError unless a clip's further arrays have names and values that its file can hold."""
+    for key, value in extras.items():
+        if not isinstance(key, str) or not key.isprintable() or key in {*taken, "", "file", "allow_pickle"}:
+            raise ValueError(
+                f"Clip.extras: expected text that is no key of a clip's file as a name, got {key!r}; rename it"
+            )
+        if (dtype := np.asarray(value).dtype).kind not in "biufcSUmM" or not dtype.itemsize:
+            raise ValueError(f"Clip.extras: {key!r}: expected numbers or text, got dtype {dtype}; convert or drop it")
 
 
 def floats(name: str, value: object, shape: tuple[int | None, ...], finite: bool = False, like: str = "") -> np.ndarray:
@@ -73,3 +99,49 @@ def check_range(config: object, low: float, high: float, *names: str) -> None:
         if not (low <= np.min(value) and np.max(value) <= high):
             wanted = f"at least {low}" if high == np.inf else f"values in [{low}, {high}]"
             raise ValueError(f"{type(config).__name__}.{name}: expected {wanted}, got {value}")
+
+
+_KINDS = {"int": Integral, "float": Real, "bool": bool | np.bool_, "str": str}
+
+
+def check_types(config: object) -> None:
+    """Raise ValueError unless a dataclass's numbers, switches and text are such, and finite; lists, of JSON, become tuples."""
+    for field in fields(config):
+        name, value, kinds = field.name, getattr(config, field.name), [field.type.removesuffix(" | None")]
+        if kinds[0].startswith("tuple["):
+            kinds, value = kinds[0][6:-1].split(", "), tuple(value) if isinstance(value, list) else value
+            object.__setattr__(config, name, value)
+        else:
+            value = (value,)
+        if (value == (None,) and field.type.endswith("| None")) or not set(kinds) <= set(_KINDS):
+            continue
+        if not isinstance(value, tuple) or len(value) != len(kinds) or not all(map(_fits, kinds, value)):
+            got = repr(getattr(config, name))
+            raise ValueError(f"{type(config).__name__}.{name}: expected {field.type}, got {got[:80]}")
+
+
+def _fits(kind: str, value: object) -> bool:
+    switch = isinstance(value, _KINDS["bool"])
+    return (
+        isinstance(value, _KINDS[kind])
+        and switch == (kind == "bool")
+        and (kind in ("bool", "str") or abs(value) < 1e300)
+    )
+
+
+def check_state(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
+    """Raise ValueError unless parameters have the names and shapes wanted, and finite values."""
+    missing, unknown = sorted(set(wanted) - set(state)), sorted(set(state) - set(wanted))
+    if missing or unknown:
+        named = (", ".join(names[:9]) + ", …" * (len(names) > 9) or "none" for names in (missing, unknown))
+        raise ValueError(
+            "parameters do not fit the config: missing parameters: {}; unknown parameters: {}".format(*named)
+        )
+    for name, value in state.items():
+        if value.shape != wanted[name].shape:
+            shapes = f"expected shape {tuple(wanted[name].shape)}, got {tuple(value.shape)}"
+            raise ValueError(f"parameters do not fit the config: {name}: {shapes}")
+        if not value.float().isfinite().all():
+            raise ValueError(
+                f"parameter {name} is not finite: its training failed, or the file is damaged; use another one"
+            )

@@ -1,9 +1,12 @@
 """The Lite benchmark: the same clips for everyone, scores that can be resumed, intervals that are right."""
 
 import json
+import os
 import sys
+import tempfile
 from dataclasses import fields, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -432,3 +435,15 @@ def test_command(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as stop:
         __main__.main()
     assert stop.value.code == 2 and "expected one of static-camera" in capsys.readouterr().err
+
+
+def test_the_cache_needs_no_home(tmp_path, monkeypatch):
+    def homeless():
+        raise RuntimeError
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)
+    assert lite_splits._cache() == tmp_path / "tapip3d_lite" / "benchmark"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", homeless)
+    assert lite_splits._cache() == tmp_path / "tapip3d_lite" / "benchmark"

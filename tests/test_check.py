@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import tapip3d_lite as t3d
+from tapip3d_lite.__main__ import check
 from tapip3d_lite.check import consistency
 from tapip3d_lite.geometry import invert, pixel_grid, unproject
 
@@ -103,6 +104,16 @@ def test_noise_and_wrong_poses_beyond_repair_are_no_mix_up(moving):
     assert t3d.check_clip(noisy) == []
     shuffled = replace(moving[0], extrinsics=moving[0].extrinsics[rng.permutation(12)])
     assert t3d.check_clip(shuffled) == []
+
+
+def test_the_command_names_an_error_that_no_fix_explains(moving, tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    moving[0].save(tmp_path / "good.npz")
+    replace(moving[0], extrinsics=moving[0].extrinsics[rng.permutation(12)]).save(tmp_path / "bad.npz")
+    check(tmp_path / "good.npz")
+    check(tmp_path / "bad.npz")
+    good, bad = capsys.readouterr().out.splitlines()
+    assert good.endswith("nothing suspicious found") and "does not fit together: relative depth error 0." in bad
 
 
 def test_one_frame_is_enough_to_call(moving):

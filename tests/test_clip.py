@@ -126,6 +126,12 @@ BAD = {
     "all-invalid depth": ({"depths": np.zeros((3, 6, 8))}, "no valid pixel"),
     "NaN intrinsics": ({"intrinsics": np.full((3, 3, 3), np.nan)}, "Clip.intrinsics: expected finite"),
     "negative focal": ({"intrinsics": -np.tile(np.eye(3), (3, 1, 1))}, "positive"),
+    "transposed intrinsics": (
+        {"intrinsics": arrays()["intrinsics"].swapaxes(-1, -2)},
+        r"\[0 0 1\], got .* frame 0; transpose",
+    ),
+    "skewed intrinsics": ({"intrinsics": arrays()["intrinsics"] + [[0, 0, 0], [0.5, 0, 0], [0, 0, 0]]}, r"\[0 fy cy\]"),
+    "scaled intrinsics": ({"intrinsics": 2 * arrays()["intrinsics"]}, "divide it by its last number"),
     "frames differ": ({"extrinsics": np.tile(np.eye(4), (2, 1, 1))}, r"Clip.extrinsics: expected shape \(3, 4, 4\)"),
     "scaled rotation": ({"extrinsics": np.tile(np.diag([2, 2, 2, 1.0]), (3, 1, 1))}, "not a rigid"),
     "mirrored": ({"extrinsics": np.tile(np.diag([-1, 1, 1, 1.0]), (3, 1, 1))}, "not a rigid"),
@@ -204,7 +210,7 @@ def bad_files(folder):
         ("absent.npz", "no such file"),
         ("rgb_only.npz", "depths, intrinsics, extrinsics missing"),
         ("scalar.npz", "Clip.video"),
-        ("foreign.npz", "missing"),
+        ("foreign.npz", "readme.txt, which is no array"),
         ("halftracks.npz", "visible, query_point missing"),
     ],
 )

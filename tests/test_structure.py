@@ -18,12 +18,12 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # A module may import from its own floor and from floors below, never above. Rooms on one floor are apart, unless the
 # later one of a floor's list uses the earlier ones.
 FLOORS = [
-    ["geometry", "files", "validate", "parts"],
+    ["geometry", "archive", "pickled", "files", "validate", "outline", "parts"],
     ["clip", "queries", "bundle", "poses"],
     ["formats"],
     ["check", "simulate", "model"],
     ["variants", "speed"],
-    ["checkpoint_reader", "official", "recorder"],
+    ["saved", "checkpoint_reader", "official", "recorder"],
     ["training", "evaluation"],
     ["figures"],
     ["export"],

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import tempfile
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -83,7 +84,8 @@ def benchmark_clips(split: str, count: int | None = None, progress: bool = True)
     """The clips of a split, or only the first `count`, named `<split>-<index>`.
 
     They are rendered on first use by all cores (a script that calls this needs the usual `if __name__ == "__main__":`),
-    then read from a cache of 1 MB a clip: `$XDG_CACHE_HOME/tapip3d_lite/benchmark`, by default under `~/.cache`.
+    then read from a cache of 1 MB a clip: `$XDG_CACHE_HOME/tapip3d_lite/benchmark`, by default under `~/.cache`,
+    or the temporary folder where that cannot be written.
 
     Raises:
         ValueError: unknown split, bad count, or rendered clips that differ from the fingerprints.
@@ -92,8 +94,7 @@ def benchmark_clips(split: str, count: int | None = None, progress: bool = True)
     if count is not None and count < 1:
         raise ValueError(f"benchmark_clips: count must be at least 1, got {count}; leave it out for all clips")
     path = split_file(split)
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tapip3d_lite" / "benchmark"
-    key = _key(path)
+    cache, key = _cache(), _key(path)
     jobs = [
         (cache / f"{split}-{index:02d}-{key}.npz", f"{split}-{index:02d}", rollout, marks)
         for index, (rollout, marks) in enumerate(load_rollouts(path)[:count])
@@ -104,6 +105,18 @@ def benchmark_clips(split: str, count: int | None = None, progress: bool = True)
         for _ in run_jobs(_render, missing):
             bar.update()
     return [clips[job[1]] or load_clip(job[0]) for job in jobs]
+
+
+def _cache() -> Path:
+    """The folder of rendered clips; where nobody's home can be written, under that of temporary files."""
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tapip3d_lite" / "benchmark"
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    except (RuntimeError, OSError):  # no home, or one that cannot be written
+        pass
+    return Path(tempfile.gettempdir()) / "tapip3d_lite" / "benchmark"
 
 
 def _key(path: Path) -> str:

@@ -66,7 +66,8 @@ def save_png(figure: Figure, path: str | Path, dpi: int = 110) -> None:
 def save_html(figure: go.Figure, path: str | Path) -> None:
     """Write a plotly figure as one page that needs no network (plotly.js is inside, about 5 MB), atomically."""
     check_suffix(path, ".html")
-    write_text(path, figure.to_html(include_plotlyjs=True, auto_play=False, validate=False))
+    page = figure.to_html(include_plotlyjs=True, auto_play=False, validate=False, div_id="figure")
+    write_text(path, page)  # the same each time, since the name of the place is not drawn at random
 
 
 shell = get_ipython()

@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks, require
-from tapip3d_lite.files import load_npz
+from tapip3d_lite.files import load_npz, map_npy
 from tapip3d_lite.formats.folders import matrix, numbered
 from tapip3d_lite.formats.images import DEPTHS, decode_color, fit_depth, read_depth
-from tapip3d_lite.formats.unpickle import load_objects
 from tapip3d_lite.geometry import in_image, invert, project, transform
 
 _JPEG = "images_jpeg_bytes"
-
-
-def npz_keys(path: Path) -> set[str]:
-    """The names of an npz file's arrays; none where it is no zip file."""
-    if not zipfile.is_zipfile(path):
-        return set()
-    with zipfile.ZipFile(path) as archive:
-        return {name.removesuffix(".npy") for name in archive.namelist()}
 
 
 def result(path: Path, points: bool) -> Clip:
@@ -57,16 +47,14 @@ def vggt(path: Path, _points: bool) -> Clip:
 
 def tapvid3d(path: Path, points: bool, depth: str | Path | None = None) -> Clip:
     """TAPVid-3D: JPEG images, tracks in each frame's camera, one camera matrix, poses or none; depth comes from elsewhere."""
-    arrays, keys = load_npz(path, skip=(_JPEG,)), ("tracks_XYZ", "visibility", "queries_xyt", "fx_fy_cx_cy")
+    arrays, keys = load_npz(path, objects=(_JPEG,)), (_JPEG, "tracks_XYZ", "visibility", "queries_xyt", "fx_fy_cx_cy")
     require(path, arrays, "TAPVid-3D", keys, "take the complete file")
     if depth is None:
         raise ValueError(
             f'{path}: TAPVid-3D holds no depth; give depth="sparse" for that of its true points, or a file or folder of '
             'estimated depth: depth="depths.npy", (T, H, W) in metres'
         )
-    with zipfile.ZipFile(path) as archive, archive.open(f"{_JPEG}.npy") as file:
-        images = load_objects(path, file)
-    video = np.stack([decode_color(bytes(image), f"{path}: image {t}") for t, image in enumerate(images)])
+    video = np.stack([decode_color(bytes(image), f"{path}: image {t}") for t, image in enumerate(arrays[_JPEG])])
     xyz, visible = arrays["tracks_XYZ"].astype(np.float64), arrays["visibility"].astype(bool)
     intrinsics = np.tile(matrix(arrays["fx_fy_cx_cy"], f"{path}: fx_fy_cx_cy"), (len(video), 1, 1))
     extrinsics = arrays.get("extrinsics_w2c", np.eye(4)).astype(np.float64)
@@ -106,10 +94,7 @@ def read_depths(path: str | Path) -> np.ndarray:
         only = next(iter(arrays.values())) if len(arrays) == 1 else np.zeros(0)
         depths = arrays.get("depths", arrays.get("depth", only))
     else:
-        try:
-            depths = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise ValueError(f"{path}: not a readable file of depth ({error}); give npy, npz or a folder") from None
+        depths = map_npy(path)
     depths = depths[..., 0] if depths.ndim == 4 else depths
     if depths.ndim != 3 or depths.dtype.kind != "f":
         raise ValueError(f"{path}: expected depth (T, H, W), floats in scene units, got {depths.shape} {depths.dtype}")

@@ -6,7 +6,6 @@ its frames may say: the fields of `Settings`, of which each layout has its own d
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.files import read_json
 from tapip3d_lite.formats.images import decode_color, fit_depth, read_depth, read_video, register_depth
 from tapip3d_lite.geometry import point_map, resize_intrinsics
 
@@ -196,14 +196,6 @@ def table(path: Path) -> list[np.ndarray]:
         return [np.array(line, np.float64) for line in lines if line and not line[0].startswith("#")]
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not a readable table of numbers ({error})") from None
-
-
-def read_json(path: Path) -> dict:
-    """A JSON file's dictionary."""
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not a readable JSON file ({error})") from None
 
 
 def read_poses(path: Path) -> np.ndarray:

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tapip3d_lite.files import map_npy
 from tapip3d_lite.geometry import pixel_grid, project, resize_intrinsics, transform, unproject
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -65,7 +66,7 @@ def read_depth(path: Path, scale: float = 1000.0, no_depth: float = 65535) -> np
     if path.suffix.lower() == ".exr":
         depth = decode_exr(data, path)
     elif path.suffix.lower() == ".npy":
-        depth = np.load(path, allow_pickle=False)
+        depth = map_npy(path)
     else:
         depth = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if depth is None:

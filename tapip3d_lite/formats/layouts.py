@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from tapip3d_lite.clip import Tracks
-from tapip3d_lite.formats.folders import Parts, Settings, numbered, read_json, read_poses, rigid, table
+from tapip3d_lite.files import load_objects, read_json
+from tapip3d_lite.formats.folders import Parts, Settings, numbered, read_poses, rigid, table
 from tapip3d_lite.formats.images import DEPTHS, PICTURES, VIDEOS, read_depth
-from tapip3d_lite.formats.unpickle import load_objects
 from tapip3d_lite.geometry import in_image
 
 _COLORS, _POSES = ("rgb", "color", "colour", "images", "frames"), ("poses.txt", "pose.txt", "poses", "pose")

@@ -44,7 +44,7 @@ def model_card(
         raise ValueError(f"card: {folder} is not a finished training; it needs config.json, log.jsonl and {path.name}")
     if also and not Path(also).is_file():
         raise ValueError(f"card: no file {also}; --also takes Markdown, such as tests.robustness writes")
-    config = TrainConfig.from_dict(json.loads((folder / "config.json").read_text(encoding="utf-8")), parts)
+    config = TrainConfig.read(folder / "config.json", parts)
     log, (scores, _) = read_log(folder), load_results(results)
     if not log or not scores:
         raise ValueError(

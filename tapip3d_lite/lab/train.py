@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
@@ -16,10 +15,10 @@ from torch import distributed
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.training.data import training_clips, validation_clips
+from tapip3d_lite.training.data import training_clips, training_config, validation_clips
 from tapip3d_lite.training.recipe import TrainConfig
-from tapip3d_lite.training.run_folder import RunFolder
-from tapip3d_lite.training.trainer import Trainer
+from tapip3d_lite.training.run_folder import RunFolder, check_folder
+from tapip3d_lite.training.trainer import Trainer, initial_weights
 from tapip3d_lite.validate import check_depths
 
 _SCORES = ("AJ3D_none", "APD3D_none", "OA", "AJ3D_none_dynamic", "APD3D_none_dynamic", "APD3D_none_static")
@@ -83,13 +82,10 @@ def train(
     Returns:
         Whether the training is finished, and a message for the user.
     """
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("train: torch sees no CUDA device; leave --device out to train on the CPU")
-    if compiled and device != "cuda":
-        raise ValueError("train: only a GPU gains from compiling; add --device cuda, or leave --compiled out")
     recipe, data = out / "config.json", data or out / "clips"
     if resume and recipe.exists():
-        config = TrainConfig.from_dict(json.loads(recipe.read_text()), [*allow, *config.custom])
+        config = TrainConfig.read(recipe, [*allow, *config.custom])
+    _refuse_at_once(config, device, workers, compiled)
     if workers is None:
         cores = (os.cpu_count() or 2) // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
         workers = 0 if device == "cpu" else max(1, cores - 2)
@@ -97,6 +93,7 @@ def train(
     with _processes(device) as is_main:
         held_out = []
         if is_main:
+            check_folder(out, config, resume)
             training_clips(data / "train", config.clips, large=large)
             held_out = validation_clips(data / "validation", config.validation) if config.validation else []
             RunFolder(out, config, resume)  # checked, and made, once for all processes
@@ -113,6 +110,25 @@ def train(
         return True, f"finished: {out / 'weights.safetensors'}"
     done = f"step {trainer.step} of {config.total}" if config.minutes is None else f"step {trainer.step}"
     return False, f"stopped and saved at {done}; continue with --resume"
+
+
+def _refuse_at_once(config: TrainConfig, device: str, workers: int | None, compiled: bool) -> None:
+    """Raise ValueError for what would fail only once the clips are simulated, or hours later."""
+    try:
+        torch.zeros(1, device=device)
+    except Exception as error:  # torch has many ways to say that there is no such device
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"train: torch sees no {device.upper()} device ({reason}); leave --device out to use the CPU"
+        ) from None
+    if compiled and not device.startswith("cuda"):
+        raise ValueError("train: only a GPU gains from compiling; add --device cuda, or leave --compiled out")
+    if (workers or 0) < 0:
+        raise ValueError(f"train: workers must not be negative, got {workers}")
+    if config.frames[1] > (there := training_config(0).frames):
+        raise ValueError(f"TrainConfig.frames: the simulated clips have {there} frames, got {config.frames}")
+    if config.init is not None:
+        initial_weights(config)
 
 
 @contextlib.contextmanager

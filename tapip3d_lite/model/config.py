@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from tapip3d_lite.parts import allowed_parts, find_part, part_name
+from tapip3d_lite.validate import check_range, check_types
 
 CHOICES = {
     "space": ("uv", "uvd", "uvlogd", "camera", "world", "first"),
@@ -21,6 +22,8 @@ CHOICES = {
 SWITCHES = ("space", "neighborhood", "context", "updater")
 INTERCHANGEABLE = ("camera", "world", "first")  # spaces that one checkpoint serves
 _MAY_BE_ZERO = ("support_grid", "visible_threshold")
+_LAYERS = ("levels", "offset_layers", "time_depth", "space_depth")
+_MOST, _MOST_LAYERS = 2**13, 64  # a file from outside may ask for anything
 
 Part = str | Callable[..., Any]
 
@@ -111,7 +114,8 @@ class TrackerConfig:
     visible_threshold: float = 0.9
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "image_size", tuple(int(side) for side in self.image_size))
+        check_types(self)
+        object.__setattr__(self, "image_size", tuple(map(int, self.image_size)))
         for name, allowed in CHOICES.items():
             value = getattr(self, name)
             if name in SWITCHES:
@@ -120,8 +124,9 @@ class TrackerConfig:
                 raise ValueError(f"TrackerConfig.{name}: expected one of {', '.join(allowed)}; got {value!r}")
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.type in ("int", "float") and value <= 0 and field.name not in _MAY_BE_ZERO:
-                raise ValueError(f"TrackerConfig.{field.name}: expected a positive number, got {value}")
+            most = _MOST_LAYERS if field.name in _LAYERS else _MOST
+            if field.type in ("int", "float") and not 0 < value <= most and field.name not in _MAY_BE_ZERO:
+                raise ValueError(f"TrackerConfig.{field.name}: expected a positive number up to {most}, got {value}")
         self._check_sizes()
         self._check_combination()
 
@@ -186,8 +191,10 @@ class TrackerConfig:
             raise ValueError(
                 f"TrackerConfig.space_depth: must divide time_depth = {self.time_depth}, got {self.space_depth}"
             )
-        if self.support_grid < 0:
-            raise ValueError(f"TrackerConfig.support_grid: expected 0 or more, got {self.support_grid}")
+        check_range(self, 0, 2**10, "support_grid")
+        check_range(self, 1, _MOST, "image_size")
+        if self.window * self.levels * self.token_dim > 2**22:
+            raise ValueError(f"TrackerConfig: window x levels x token_dim must be at most {2**22}; lower one of them")
         if not 0 <= self.visible_threshold <= 1:
             raise ValueError(f"TrackerConfig.visible_threshold: expected a probability, got {self.visible_threshold}")
         if self.outputs not in (4, 5) or (self.separate_vis_head and self.outputs != 5):

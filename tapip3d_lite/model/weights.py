@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from torch import Tensor
 from tapip3d_lite.files import atomic_path
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.tracker import Tracker
+from tapip3d_lite.outline import NoValues
+from tapip3d_lite.validate import check_state
 
 _FORMAT = "tapip3d_lite"
 
@@ -30,12 +33,17 @@ def save_weights(tracker: Tracker, path: str | Path, half: bool = False) -> None
     With `half` floats are stored in 16 bits, which halves the file; they are read back as 32-bit ones.
 
     Raises:
-        ValueError: the tracker has a custom part that is no class, which no file can name.
+        ValueError: the tracker has a custom part that is no class, which no file can name, or parameters that are not finite.
     """
     config = json.dumps(tracker.config.to_dict())
     state = {name: (x.half() if half else x).contiguous() for name, x in tracker.state_dict().items()}
+    check_state(state, state)
+    data = safetensors.torch.save(state, metadata={"format": _FORMAT, "config": config})
+    end = 8 + int.from_bytes(data[:8], "little")
+    header = json.dumps(json.loads(data[8:end]), sort_keys=True)  # else in random order: same weights, same bytes
+    header += " " * (-len(header) % 8)
     with atomic_path(path) as temporary:
-        safetensors.torch.save_file(state, temporary, metadata={"format": _FORMAT, "config": config})
+        temporary.write_bytes(len(header).to_bytes(8, "little") + header.encode() + data[end:])
 
 
 def load_weights(path: str | Path, device: str = "cpu", fast: bool = True, parts: Sequence[Any] = ()) -> Tracker:
@@ -44,14 +52,17 @@ def load_weights(path: str | Path, device: str = "cpu", fast: bool = True, parts
     Custom parts that the file names must be among `parts`: classes, matched by name, or names of modules to import.
 
     Raises:
-        ValueError: missing, truncated or foreign file, a part that is not allowed, or parameters that do not fit.
+        ValueError: missing, truncated or foreign file, a part that is not allowed, or parameters that do not fit the config
+            or are not finite.
     """
     state, config = read_weights(path)
-    tracker = Tracker(TrackerConfig.from_dict(config, parts), fast)
     try:
-        tracker.load_state_dict(state)
-    except RuntimeError as error:
-        raise ValueError(f"{path}: parameters do not fit the config: {str(error).splitlines()[-1].strip()}") from error
+        made = TrackerConfig.from_dict(config, parts)
+        check_state(state, outline(made).state_dict())
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    tracker = Tracker(made, fast)
+    tracker.load_state_dict(state)
     return tracker.to(device).eval()
 
 
@@ -69,4 +80,16 @@ def read_weights(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         ) from error
     if metadata.get("format") != _FORMAT:
         raise ValueError(f"{path}: safetensors without a {_FORMAT} config; it belongs to another program")
-    return state, json.loads(metadata["config"])
+    try:
+        config = json.loads(metadata["config"])
+    except (ValueError, KeyError, RecursionError) as error:
+        raise ValueError(f"{path}: no readable config ({error}); the file is damaged") from error
+    if not isinstance(config, dict):
+        raise ValueError(f"{path}: expected a config of named fields, got {type(config).__name__}; the file is damaged")
+    return state, config
+
+
+def outline(config: TrackerConfig) -> Tracker:
+    """A tracker whose parameters have shapes but take no memory (unless parts are custom), to compare a file with."""
+    with nullcontext() if config.custom else NoValues():
+        return Tracker(config, fast=False)

@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tapip3d_lite.files import write_text
+from tapip3d_lite.files import locked, write_text
 from tapip3d_lite.simulate.settings import SimulationConfig
 from tapip3d_lite.simulate.simulator import simulate_clip
 
@@ -36,7 +36,7 @@ def simulate_dataset(
     several workers needs the usual `if __name__ == "__main__":`.
 
     Args:
-        out: the folder; made if missing. Only one run may write to it at a time.
+        out: the folder; made if missing. Only one process may write to it at a time.
         count: number of clips.
         config: what they contain, or a function that returns it for each seed; default values if None.
         first_seed: non-negative.
@@ -47,7 +47,7 @@ def simulate_dataset(
         The paths of all `count` clips, in the order of their seeds.
 
     Raises:
-        ValueError: bad number, or the folder holds clips of another configuration.
+        ValueError: bad number, or the folder holds clips of another configuration, or another process writes to it.
     """
     for name, value, low in (("count", count, 1), ("first_seed", first_seed, 0), ("workers", workers or 1, 1)):
         if not isinstance(value, int) or value < low:
@@ -56,9 +56,15 @@ def simulate_dataset(
     _claim(folder, config)
     jobs = [(folder / f"clip_{seed:06d}.npz", seed, config) for seed in range(first_seed, first_seed + count)]
     missing = [job for job in jobs if not job[0].exists()]
-    with tqdm(total=count, initial=count - len(missing), unit="clip", disable=not progress) as bar:
-        for _ in run_jobs(_write, missing, workers):
-            bar.update()
+    if missing:
+        with (
+            locked(folder / ".lock", "simulate_dataset: the folder"),
+            tqdm(total=count, initial=count - len(missing), unit="clip", disable=not progress) as bar,
+        ):
+            for leftover in folder.glob(".clip_*.npz"):
+                leftover.unlink(missing_ok=True)
+            for _ in run_jobs(_write, missing, workers):
+                bar.update()
     return [job[0] for job in jobs]
 
 
@@ -81,7 +87,7 @@ def leave_interrupts(worker: int = 0) -> None:
 
 
 def _claim(folder: Path, config: SimulationConfig | Recipe) -> None:
-    """Write the folder's description, or check that it is the same; delete half-written files."""
+    """Write the folder's description, or check that it is the same."""
     path, description = folder / DESCRIPTION, _describe(config)
     if path.exists():
         stored = _read(path)
@@ -97,8 +103,6 @@ def _claim(folder: Path, config: SimulationConfig | Recipe) -> None:
         raise ValueError(f"simulate_dataset: {folder} holds clips but no {DESCRIPTION}; choose another folder")
     else:
         write_text(path, json.dumps(description, indent=2) + "\n")
-    for leftover in folder.glob(".clip_*.npz"):
-        leftover.unlink()
 
 
 def _describe(config: SimulationConfig | Recipe) -> dict:

@@ -21,7 +21,7 @@ import numpy as np
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project
 from tapip3d_lite.training.data import query_rows
-from tapip3d_lite.validate import check_range
+from tapip3d_lite.validate import check_range, check_types
 
 SAME_SURFACE = 0.05  # neighbouring depths that differ by less are interpolated, others belong to two surfaces
 GRAY = np.array([0.299, 0.587, 0.114])
@@ -70,8 +70,7 @@ class AugmentConfig:
     flip_y: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("erase_side", "blur_sigma", "depth_blur_sigma", "scale", "jitter_strength"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))  # lists come from JSON
+        check_types(self)
         check_range(
             self, 0, 1, "erase", "jitter", "jitter_strength", "blur", "depth_blur", "reframe", "flip_x", "flip_y"
         )

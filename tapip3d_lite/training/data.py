@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from tapip3d_lite.clip import Clip, Tracks, clip_arrays
-from tapip3d_lite.files import atomic_path, load_npz
+from tapip3d_lite.files import atomic_path, load_npz, map_npy
 from tapip3d_lite.formats import load_clip
 from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
@@ -30,7 +30,7 @@ from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
 from tapip3d_lite.simulate.degrade import log_uniform
 from tapip3d_lite.simulate.seeds import TRAINING, VALIDATION
 from tapip3d_lite.training.loss import Truth
-from tapip3d_lite.validate import check_range, floats, video_frames
+from tapip3d_lite.validate import check_range, check_types, floats, video_frames
 
 
 def training_config(seed: int) -> SimulationConfig:
@@ -100,6 +100,7 @@ class SamplingConfig:
     backward: float = 0.5
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_range(self, 1, math.inf, "tracks")
         check_range(self, 0, 1, "seen", "anywhere", "backward")
 
@@ -289,4 +290,4 @@ class FeatureCache:
             features = self.encoder(frames.rgb)[0]
             with atomic_path(path) as temporary:
                 np.save(temporary, features.half().cpu().numpy())
-        return torch.from_numpy(np.load(path, mmap_mode="r")[index]).float()
+        return torch.from_numpy(map_npy(path)[index]).float()

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from tapip3d_lite.geometry import RASTER, THRESHOLDS, transform
 from tapip3d_lite.model.windows import Step
-from tapip3d_lite.validate import check_range
+from tapip3d_lite.validate import check_range, check_types
 
 FORMS = ("paper", "pixels")
 
@@ -67,6 +67,7 @@ class LossConfig:
     within: float = 0.0
 
     def __post_init__(self) -> None:
+        check_types(self)
         if self.form not in FORMS:
             raise ValueError(f'LossConfig.form: expected "paper" or "pixels", got {self.form!r}')
         check_range(self, 0, math.inf, "visibility", "scale", "soften", "within")

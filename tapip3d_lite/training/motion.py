@@ -17,7 +17,7 @@ from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert
 from tapip3d_lite.poses import move
 from tapip3d_lite.simulate.degrade import log_uniform, pose_error
-from tapip3d_lite.validate import check_range
+from tapip3d_lite.validate import check_range, check_types
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,8 @@ class MotionConfig:
     pose_noise: tuple[float, float] = (0.05, 2.5)
 
     def __post_init__(self) -> None:
-        for name in ("slide", "pose_noise"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))  # lists come from JSON
-            check_range(self, 1e-9, math.inf, name)
+        check_types(self)
+        check_range(self, 1e-9, math.inf, "slide", "pose_noise")
         check_range(self, 0, 1, "world", "turned", "still", "smoothing", "sliding", "wrong")
         check_range(self, 0, math.inf, "velocity", "velocity_noise", "rotation", "rotation_noise")
         if self.world + self.turned > 1:

@@ -8,6 +8,7 @@ such features learns to follow motion in fewer steps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from tapip3d_lite.geometry import pixel_grid, project
 from tapip3d_lite.model.blocks import constant
 from tapip3d_lite.training.augment import AugmentConfig, augment
 from tapip3d_lite.training.data import pick_frames
+from tapip3d_lite.validate import check_range, check_types
 
 _ENOUGH = 16  # points that two frames should share
 _NEAR = 2.5  # radius in cells, around the true place, of the cells whose mean gives a point's place
@@ -41,6 +43,9 @@ class MatchingConfig:
             their similarities. This teaches the place within a cell.
         jitter: strength of random brightness and contrast, drawn for each frame (without `augment`).
         lr, weight_decay, clip_norm: of AdamW with one cycle.
+
+    Raises:
+        ValueError: a number outside its range.
     """
 
     pairs: int = 1
@@ -53,6 +58,13 @@ class MatchingConfig:
     lr: float = 1e-3
     weight_decay: float = 1e-4
     clip_norm: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        check_range(self, 1, math.inf, "pairs", "points", "gap", "levels")
+        check_range(self, 1e-12, math.inf, "spread", "clip_norm")
+        check_range(self, 1e-12, 1e3, "lr")
+        check_range(self, 0, math.inf, "place", "jitter", "weight_decay")
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,10 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
+from pathlib import Path
 from typing import Any
 
+from tapip3d_lite.files import read_json
 from tapip3d_lite.model.config import SWITCHES, TrackerConfig
 from tapip3d_lite.parts import allowed_parts, find_part, part_name
 from tapip3d_lite.training.augment import AugmentConfig
@@ -15,7 +17,7 @@ from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.loss import FORMS, LossConfig
 from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.pretrain import MatchingConfig
-from tapip3d_lite.validate import check_range
+from tapip3d_lite.validate import check_range, check_types
 
 
 @dataclass(frozen=True)
@@ -94,19 +96,26 @@ class TrainConfig:
         loss = self.loss if isinstance(self.loss, LossConfig) else find_part("TrainConfig.loss", self.loss, FORMS)
         object.__setattr__(self, "loss", LossConfig(form=loss) if isinstance(loss, str) else loss)
         for name in ("frames", "iterations"):
-            value = getattr(self, name)  # lists come from JSON
-            object.__setattr__(self, name, (value, value) if isinstance(value, int) else tuple(value))
-            if len(getattr(self, name)) != 2 or not 1 <= getattr(self, name)[0] <= getattr(self, name)[1]:
-                raise ValueError(f"TrainConfig.{name}: expected (fewest, most), both at least 1, got {value}")
+            value = getattr(self, name)
+            object.__setattr__(self, name, (value, value) if isinstance(value, int) else value)
+        check_types(self)
+        for name in ("frames", "iterations"):
+            if not 1 <= getattr(self, name)[0] <= getattr(self, name)[1]:
+                raise ValueError(
+                    f"TrainConfig.{name}: expected (fewest, most), both at least 1, got {getattr(self, name)}"
+                )
         check_range(self, 1, math.inf, "clips", "steps", "batch", "evaluate_every", "save_every")
-        check_range(self, 0, math.inf, "matching_steps", "validation", "average")
+        check_range(self, 0, math.inf, "matching_steps", "validation", "average", "weight_decay", "head")
+        check_range(self, 0, 2**63, "seed")
         check_range(self, 0, 1, "short", "sensor")
         if self.minutes is not None and self.minutes <= 0:
             raise ValueError(f"TrainConfig.minutes: expected a positive time or None, got {self.minutes}")
         if self.precision not in ("float32", "bfloat16"):
             raise ValueError(f'TrainConfig.precision: expected "float32" or "bfloat16", got {self.precision!r}')
-        if self.lr <= 0 or not 0 < self.warmup < 1:
-            raise ValueError(f"TrainConfig: lr must be positive, warmup in (0, 1), got {self.lr} and {self.warmup}")
+        check_range(self, 1e-12, 1e3, "lr")
+        check_range(self, 1e-12, math.inf, "clip_norm")
+        if not 0 < self.warmup < 1:
+            raise ValueError(f"TrainConfig.warmup: expected a value in (0, 1), got {self.warmup}")
         if self.augment and not self.train_encoder:
             raise ValueError(
                 "TrainConfig.augment: features of a frozen encoder are stored in files and cannot follow changed images; "
@@ -192,6 +201,11 @@ class TrainConfig:
         made = {
             name: type(usual[name])(**x)
             for name, x in values.items()
-            if is_dataclass(usual[name]) and isinstance(x, dict)
+            if is_dataclass(usual[name]) and (isinstance(x, dict) or name != "loss")
         }
         return cls(**(values | made))
+
+    @classmethod
+    def read(cls, path: str | Path, parts: Sequence[Any] = ()) -> TrainConfig:
+        """The recipe in a training's `config.json`, with `parts` as for `from_dict`; a damaged file is a ValueError."""
+        return read_json(path, lambda values: cls.from_dict(values, parts))

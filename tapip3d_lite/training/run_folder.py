@@ -14,9 +14,11 @@ from typing import Any
 import torch
 from tqdm.auto import tqdm
 
-from tapip3d_lite.files import atomic_path, write_text
+from tapip3d_lite.files import atomic_path, locked, read_json, write_text
+from tapip3d_lite.saved import read_saved
 from tapip3d_lite.training.recipe import TrainConfig
 
+_SAVED = ("model", "optimizer", "step", "position", "seconds")
 _SMOOTH = 0.98  # of the running means that the bar shows
 
 
@@ -28,27 +30,34 @@ class RunFolder:
 
         A folder that holds a training already (without `resume`), or one of another recipe, is a ValueError.
         """
+        check_folder(path, config, resume)
         self.path = Path(path)
         self._log, self._checkpoint, recipe = (self.path / x for x in ("log.jsonl", "checkpoint.pt", "config.json"))
-        wanted = config.to_dict()
         if not recipe.exists():
-            write_text(recipe, json.dumps(wanted, indent=2) + "\n")
-            return
-        if not resume:
-            raise ValueError(f"train: {path} holds a training already; continue with --resume or choose another folder")
-        stored = TrainConfig.complete(json.loads(recipe.read_text()))  # whose parts are not imported
-        different = [f"{k}={stored[k]!r} (now {v!r})" for k, v in wanted.items() if stored[k] != v]
-        if different:
-            raise ValueError(f"train: {path} was begun with another recipe: {', '.join(different)}; use its own")
+            write_text(recipe, json.dumps(config.to_dict(), indent=2) + "\n")
 
-    def checkpoint(self, device: str) -> dict[str, Any] | None:
-        """Load the newest checkpoint, if there is one, and cut the log back to it."""
-        exists = self._checkpoint.exists()
-        saved = torch.load(self._checkpoint, map_location=device, weights_only=True) if exists else None
+    def checkpoint(self, repair: bool = True) -> dict[str, Any] | None:
+        """Load the newest checkpoint, if there is one; ValueError if it is damaged.
+
+        `repair` cuts the log back to it, and deletes what a killed process left half-written.
+        """
+        saved = read_saved(self._checkpoint) if self._checkpoint.exists() else None
+        if saved is not None and not (isinstance(saved, dict) and {*_SAVED} <= saved.keys()):
+            raise ValueError(
+                f"{self._checkpoint}: no checkpoint of a training, which has {', '.join(_SAVED)}; delete it"
+            )
+        if not repair:
+            return saved
+        for leftover in self.path.rglob(".*.*.*"):
+            leftover.unlink(missing_ok=True)
         if self._log.exists():
             kept = [line for line in read_log(self._log) if saved is not None and line["step"] <= saved["step"]]
             write_text(self._log, "".join(json.dumps(line) + "\n" for line in kept))
         return saved
+
+    def locked(self) -> contextlib.AbstractContextManager[None]:
+        """Keep other processes from training here; ValueError if one does."""
+        return locked(self.path / ".lock", "train: the folder")
 
     def save(self, state: dict[str, Any]) -> None:
         """Replace the checkpoint atomically."""
@@ -61,14 +70,27 @@ class RunFolder:
             file.write(json.dumps(line) + "\n")
 
     def save_failure(self, line: dict[str, Any], norm: float, drawn: dict[str, Any]) -> str:
-        """Save the batch of a step whose loss or gradient is not finite; returns the message for the user."""
+        """Save the batch of a step whose loss, gradient or weights are not finite; returns the message for the user."""
         path = self.path / f"not_finite_{line['step']}.pt"
         with atomic_path(path) as temporary:
             torch.save({"line": line, "norm": norm, **drawn}, temporary)
         return (
-            f"train: loss {line['loss']} and gradient norm {norm} in step {line['step']} are not finite; the weights are "
-            f"unchanged. Its batch is in {path}, the last checkpoint in {self._checkpoint}; lower the learning rate"
+            f"train: loss {line['loss']} and gradient norm {norm} in step {line['step']} are not finite, or make the "
+            f"weights so. Its batch is in {path}, the last checkpoint in {self._checkpoint}; lower the learning rate"
         )
+
+
+def check_folder(path: str | Path, config: TrainConfig, resume: bool) -> None:
+    """Raise ValueError where a folder holds a training already (without `resume`), or one of another recipe."""
+    recipe = Path(path) / "config.json"
+    if not recipe.exists():
+        return
+    if not resume:
+        raise ValueError(f"train: {path} holds a training already; continue with --resume or choose another folder")
+    stored, wanted = read_json(recipe, TrainConfig.complete), config.to_dict()  # imports no parts
+    different = [f"{k}={stored[k]!r} (now {v!r})" for k, v in wanted.items() if stored[k] != v]
+    if different:
+        raise ValueError(f"train: {path} was begun with another recipe: {', '.join(different)}; use its own")
 
 
 class Bar(tqdm):

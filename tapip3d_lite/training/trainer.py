@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.registry import fast_step
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.model.weights import read_weights, save_weights
+from tapip3d_lite.model.weights import outline, read_weights, save_weights
 from tapip3d_lite.model.windows import Step
 from tapip3d_lite.parts import make_part
 from tapip3d_lite.training.backward import add_gradients, losses
@@ -32,6 +33,7 @@ from tapip3d_lite.training.pretrain import FramePair, matching_loss
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.run_folder import Bar, RunFolder
 from tapip3d_lite.training.schedule import Schedule, adamw
+from tapip3d_lite.validate import check_state
 
 
 class Trainer:
@@ -83,14 +85,14 @@ class Trainer:
         self._loss = make_part("TrainConfig.loss", config.loss)
         if isinstance(self._loss, nn.Module):
             self._loss.to(device)
-        self.folder = RunFolder(folder, config, resume)
         with torch.random.fork_rng():  # leaves the caller's random generator as it is
             torch.manual_seed(config.seed)
             self.tracker = Tracker(config.tracker_config()).to(device).train()
             if isinstance(head := getattr(self.tracker.updater, "head", None), nn.Linear):
                 nn.init.normal_(head.weight, std=config.head)
         if config.init is not None:
-            _start_from(self.tracker, config.init)
+            self.tracker.load_state_dict(initial_weights(config))
+        self.folder = RunFolder(folder, config, resume)
         self.group, self.step, self.seconds = Group(device), 0, 0.0
         self._on_gpu, cache = torch.device(device).type == "cuda", None
         if not config.train_encoder and not self._on_gpu:
@@ -98,8 +100,10 @@ class Trainer:
             cache = FeatureCache(self.folder.path / "features", self.tracker.encoder, size)
             cache.check_room(clips)
         self.examples = Examples(config, clips, self.group.rank, cache)
-        saved = self.folder.checkpoint(device)
+        with self.folder.locked() if self.group.is_main else nullcontext():
+            saved = self.folder.checkpoint(repair=self.group.is_main)
         if saved is not None:
+            check_state(saved["model"], self.tracker.state_dict())
             self.tracker.load_state_dict(saved["model"])
             self.step, self.seconds = saved["step"], saved["seconds"]
         self.schedule = Schedule(config, self.group, 0 if saved is None else saved["position"])
@@ -115,7 +119,7 @@ class Trainer:
         """Train until the end, or until `stop()` is true after a step; either way everything is saved.
 
         Returns whether the training is finished. `progress` shows a bar with loss, accuracy, speed and remaining time. If
-        the loss or a gradient is not finite, the batch is saved in the folder, and a FloatingPointError raised.
+        the loss, a gradient or a weight is not finite, the batch is saved in the folder, and a FloatingPointError raised.
         """
         with Bar(self.schedule.position, self.config.total, progress and self.group.is_main) as bar:
             for line in self.steps(stop):
@@ -127,6 +131,10 @@ class Trainer:
 
         When the caller asks for the next step and `stop()` is true, everything is saved instead.
         """
+        with self.folder.locked() if self.group.is_main else nullcontext():
+            yield from self._steps(stop)
+
+    def _steps(self, stop: Callable[[], bool]) -> Iterator[dict]:
         self.schedule.start_clock()
         halted = False
         while not self.schedule.finished and not halted:
@@ -165,6 +173,8 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group |= {"lr": lr, "betas": (beta1, group["betas"][1])}
         self.optimizer.step()
+        if not np.isfinite(float(nn.utils.get_total_norm([p.detach() for p in self.parameters]))):
+            raise FloatingPointError(self.folder.save_failure(line, norm, self._drawn))
         self.step += 1
         self._add_to_average()
         self.seconds += time.perf_counter() - started
@@ -236,14 +246,14 @@ class Trainer:
         return scores
 
 
-def _start_from(tracker: Tracker, name: str) -> None:
-    """Load weights, `"lite"` or a file, into a tracker; other sizes raise a ValueError that names one of them."""
+def initial_weights(config: TrainConfig) -> dict[str, Tensor]:
+    """The weights that a recipe's `init` names; a ValueError if they are not readable or of other sizes."""
+    state = read_weights(shipped_weights().get(config.init, config.init))[0]
     try:
-        tracker.load_state_dict(read_weights(shipped_weights().get(name, name))[0])
-    except RuntimeError as error:
-        raise ValueError(
-            f"TrainConfig.init: {name!r} belongs to a tracker of other sizes: {str(error).splitlines()[-1].strip()}"
-        ) from error
+        check_state(state, outline(config.tracker_config()).state_dict())
+    except ValueError as error:
+        raise ValueError(f"TrainConfig.init: {config.init!r} belongs to a tracker of other sizes: {error}") from None
+    return state
 
 
 def _compile(tracker: Tracker) -> None:
