@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Collection, Iterable
+
 import numpy as np
 
 
@@ -73,3 +76,12 @@ def check_range(config: object, low: float, high: float, *names: str) -> None:
         if not (low <= np.min(value) and np.max(value) <= high):
             wanted = f"at least {low}" if high == np.inf else f"values in [{low}, {high}]"
             raise ValueError(f"{type(config).__name__}.{name}: expected {wanted}, got {value}")
+
+
+def check_names(where: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Raise ValueError for the first name that is not known; it says which known ones are near."""
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, sorted(known), 3, 0.5)
+            hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(sorted(known))}"
+            raise ValueError(f"{where}: no {name!r}; {hint}")

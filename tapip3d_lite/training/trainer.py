@@ -57,6 +57,7 @@ class Trainer:
         resume: bool = False,
         workers: int = 0,
         compiled: bool = False,
+        encoder: str | Path | None = None,
     ) -> None:
         """Start a training, or continue one.
 
@@ -70,6 +71,8 @@ class Trainer:
             resume: continue from the folder's checkpoint, if there is one.
             workers: processes that make examples ahead of time; for a GPU, which would otherwise wait for them.
             compiled: compile the tracker's parts, which takes minutes and then makes each step faster (GPU).
+            encoder: folder of a training whose encoder is taken over; the features of a frozen one are stored there, for
+                all trainings that share it.
 
         Raises:
             ValueError: no clips, or unusable ones; the folder holds a training already (without `resume`) or one of
@@ -86,11 +89,14 @@ class Trainer:
             nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
         if config.init is not None:
             _start_from(self.tracker, config.init)
+        source = self.folder.path if encoder is None else Path(encoder)
+        if encoder is not None:
+            self.tracker.encoder.load_state_dict(load_weights(source / "weights.safetensors").encoder.state_dict())
         self.group, self.step, self.seconds = Group(device), 0, 0.0
         self._on_gpu, cache = torch.device(device).type == "cuda", None
         if not config.train_encoder and not self._on_gpu:
             size = self.tracker.config.image_size
-            cache = FeatureCache(self.folder.path / "features", self.tracker.encoder, size)
+            cache = FeatureCache(source / "features", self.tracker.encoder, size)
             cache.check_room(clips)
         self.examples = Examples(config, clips, self.group.rank, cache)
         saved = self.folder.checkpoint(device)
