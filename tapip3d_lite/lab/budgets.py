@@ -1,6 +1,6 @@
 """`Budget`: what all rows of a study have in common, that is the recipe, the clips to train on and the clips to be judged by.
 
-All sizes stand here: `BUDGETS["lab"]` trains a row in minutes on one core.
+All sizes stand here: `BUDGETS["lab"]` trains a row in minutes on one core, `"tiny"` in seconds, to try whether it runs.
 """
 
 from __future__ import annotations
@@ -25,6 +25,11 @@ from tapip3d_lite.training.recipe import TrainConfig
 def lab_scene(seed: int) -> SimulationConfig:
     """Half a second in 64 x 64 pixels; every other clip with a still camera."""
     return SimulationConfig(frames=12, fps=24.0, size=(64, 64), tracks=192, camera=("static", "arc")[seed % 2])
+
+
+def tiny_scene(seed: int) -> SimulationConfig:
+    """A third of a second in 32 x 32 pixels."""
+    return SimulationConfig(frames=8, fps=24.0, size=(32, 32), tracks=48, camera=("static", "arc")[seed % 2])
 
 
 @dataclass(frozen=True)
@@ -63,29 +68,41 @@ class Budget:
         return cls(**{**values, **changed})
 
 
-_SMALL = {
+_LAB = {
     "image_size": (64, 64), "stride": 2, "levels": 3, "neighbors": 9, "iterations": 2, "feature_dim": 32,
     "token_dim": 32, "context_head_dim": 32, "offset_dim": 32, "hidden": 96, "heads": 4, "head_dim": 24,
     "time_depth": 2, "space_depth": 2, "virtual_tracks": 8,
 }  # fmt: skip
-
+_TINY = {
+    "image_size": (32, 32), "window": 4, "levels": 2, "neighbors": 4, "feature_dim": 16, "token_dim": 16,
+    "context_head_dim": 16, "offset_dim": 16, "hidden": 32, "heads": 2, "head_dim": 16, "iterations": 2,
+    "time_depth": 1, "space_depth": 1, "virtual_tracks": 4,
+}  # fmt: skip
+_FOCUSED = {  # all of the steps go into the world frame and into perfect depth
+    "motion": MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0),
+    "sensor": 0.0,
+    "lr": 1.5e-3,
+    "iterations": 2,
+}
+_LAB_STEPS = {
+    "clips": 240,
+    "matching_steps": 600,
+    "steps": 1500,
+    "average": 150,
+    "evaluate_every": 250,
+    "validation": 8,
+}
+_TINY_STEPS = {"clips": 4, "matching_steps": 4, "steps": 12, "average": 4, "evaluate_every": 6, "validation": 1}
 BUDGETS = {
-    "lab": Budget(
+    "lab": Budget(TrainConfig(tracker=_LAB, frames=8, sampling=SamplingConfig(tracks=48), **_LAB_STEPS, **_FOCUSED)),
+    "tiny": Budget(
         TrainConfig(
-            tracker=_SMALL,
-            clips=240,
-            frames=8,
-            iterations=2,
-            lr=1.5e-3,
-            motion=MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0),
-            sensor=0.0,
-            sampling=SamplingConfig(tracks=48),
-            matching_steps=600,
-            steps=1500,
-            average=150,
-            evaluate_every=250,
-            validation=8,
-        )
+            tracker=_TINY, frames=(4, 6), sampling=SamplingConfig(tracks=6), save_every=3, **_TINY_STEPS, **_FOCUSED
+        ),
+        tiny_scene,
+        held_out=4,
+        frames=6,
+        points=12,
     ),
 }
 
@@ -116,7 +133,9 @@ def own_clips(train: Path, held_out: Path, budget: Budget) -> Data:
     for folder, count in ((train, budget.recipe.clips), (held_out, budget.held_out)):
         paths = sorted(Path(folder).glob("*.npz"))
         if len(paths) < count:
-            raise ValueError(f"Study: {folder} holds {len(paths)} clips, {count} are needed; add some, or lower the number")
+            raise ValueError(
+                f"Study: {folder} holds {len(paths)} clips, {count} are needed; add some, or lower the number"
+            )
         found.append(tuple(paths[:count]))
     return Data(found[0], (), found[1])
 

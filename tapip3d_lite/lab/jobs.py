@@ -10,6 +10,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,7 @@ def do(job: Job, tell: Tell, stop: Stop) -> str:
         if stop():
             return STOPPED
         row = Variant(**values)
-        tracker = at_test(load_tracker(job.folder / "weights.safetensors" if job.folder else row.given, job.device), row)
+        tracker = tracker_of(row, job.folder, job.device)
         scores = score(tracker, row, clips)
         costs = track_costs(tracker, clips[0], row.options()) | (step_costs(job.folder) if job.folder else {})
         write_text(file, json.dumps({**facts, "costs": costs, "scores": scores}, indent=1) + "\n")
@@ -108,8 +109,9 @@ def _trained(job: Job, tell: Tell, stop: Stop) -> bool:
     return weights.exists()
 
 
-def at_test(tracker: TrackerLike, row: Variant) -> TrackerLike:
-    """The tracker with the fields that the row changes after the training, and the same weights."""
+def tracker_of(row: Variant, folder: Path | str | None, device: str = "cpu") -> TrackerLike:
+    """A row's tracker, given or from the folder of its training, with the fields that the row changes after it."""
+    tracker = load_tracker(row.given if folder is None else Path(folder) / "weights.safetensors", device)
     changed = row.test_fields()
     if not changed:
         return tracker
@@ -117,7 +119,7 @@ def at_test(tracker: TrackerLike, row: Variant) -> TrackerLike:
         raise ValueError(f"row {row.name!r}: {row.given} has no {', '.join(changed)}; only a learnt tracker has")
     other = Tracker(tracker.config.replace(**changed))
     other.load_state_dict(tracker.state_dict())
-    return other.to(next(tracker.parameters()).device).eval()
+    return other.to(device).eval()
 
 
 def score(tracker: TrackerLike, row: Variant, clips: Sequence[Clip]) -> dict[str, dict[str, float | None]]:
@@ -143,7 +145,7 @@ def track_costs(tracker: TrackerLike, clip: Clip, options: dict[str, Any]) -> di
 def step_costs(folder: Path) -> dict[str, float]:
     """Steps of a training, and the median time of one in milliseconds."""
     seconds = [0.0, *(line["seconds"] for line in read_log(folder))]
-    taken = [b - a for a, b in zip(seconds, seconds[1:], strict=False)]
+    taken = [b - a for a, b in pairwise(seconds)]
     return {"steps": len(taken), "step_ms": round(1000 * statistics.median(taken), 2)}
 
 
@@ -155,7 +157,7 @@ def probe(job: Job, folder: Path) -> tuple[float, float]:
     with FlopCounterMode(display=False) as counter:
         seconds = [next(steps)["seconds"] for _ in range(3)]
     seconds = [*seconds[-1:], *(line["seconds"] for line in steps)]
-    taken = statistics.median(b - a for a, b in zip(seconds, seconds[1:], strict=False))
+    taken = statistics.median(b - a for a, b in pairwise(seconds))
     return taken, counter.get_total_flops() / 3
 
 
@@ -165,16 +167,19 @@ def do_all(jobs: Sequence[Job], processes: int, tell: Callable[[str, int], None]
     A job that fails, or whose process dies, leaves the others alone. A full disk stops all: ValueError.
     """
     if processes == 1:
-        return {job.name: STOPPED if stop() else _tried(job, lambda n, job=job: tell(job.name, n), stop) for job in jobs}
+        return {
+            job.name: STOPPED if stop() else _tried(job, lambda n, job=job: tell(job.name, n), stop) for job in jobs
+        }
     context, waiting, running, ended = multiprocessing.get_context("spawn"), list(jobs), {}, {}
     try:
         while waiting or running:
             halted = stop()
             while waiting and len(running) < processes and not halted:
-                running[(started := _start(context, waiting.pop(0)))[0]] = started
+                started = _start(context, waiting.pop(0))
+                running[started[0]] = started
             ended |= {job.name: STOPPED for job in waiting} if halted else {}
             waiting = [] if halted else waiting
-            for connection, process, job in list(running.values()) if halted else ():
+            for connection, *_ in running.values() if halted else ():
                 with contextlib.suppress(OSError):
                     connection.send(STOPPED)
             for connection in wait(list(running), 0.2):
@@ -237,7 +242,9 @@ def _tried(job: Job, tell: Tell, stop: Stop) -> str:
     try:
         return do(job, now_and_then, stop)
     except OSError as error:
-        outcome = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"{type(error).__name__}: {error}"
+        outcome = (
+            "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"{type(error).__name__}: {error}"
+        )
     except Exception as error:  # whatever a custom part raises
         outcome = f"{type(error).__name__}: {error}".splitlines()[0]
     finally:
@@ -247,7 +254,9 @@ def _tried(job: Job, tell: Tell, stop: Stop) -> str:
 
 def _refuse_full_disk(outcome: str) -> str:
     if outcome == "the disk is full":
-        raise ValueError("Study: the disk is full; make room and run it again: what was saved is kept, and it goes on there")
+        raise ValueError(
+            "Study: the disk is full; make room and run it again: what was saved is kept, and it goes on there"
+        )
     return outcome
 
 

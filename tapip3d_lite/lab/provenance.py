@@ -26,7 +26,9 @@ def plain(value: Any) -> Any:
         return str(value)
     if hasattr(value, "__qualname__"):
         return f"{value.__module__}:{value.__qualname__}"
-    raise ValueError(f"{value!r} has no name by which another process could find it; give a class or function of a module")
+    raise ValueError(
+        f"{value!r} has no name by which another process could find it; give a class or function of a module"
+    )
 
 
 def own_code(values: Any) -> dict[str, str]:
@@ -62,7 +64,9 @@ def _config(source: Any) -> Any:
         for name in ("config.json", "study.json"):
             if (path := Path(source) / name).exists():
                 return json.loads(path.read_text(encoding="utf-8"))
-        raise ValueError(f"diff: {source} holds neither config.json nor study.json; give a training's or study's folder")
+        raise ValueError(
+            f"diff: {source} holds neither config.json nor study.json; give a training's or study's folder"
+        )
     return source.to_dict() if hasattr(source, "to_dict") else json.loads(json.dumps(source, default=plain))
 
 
@@ -90,9 +94,3 @@ def _spoken(source: str) -> str:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
             node.body = node.body[1:]
     return ast.dump(tree)
-
-
-def changed_code(old: Mapping[str, str], new: Mapping[str, str]) -> list[str]:
-    """Names of files and packages that differ; modules of custom parts only where both name them."""
-    either = sorted({*old, *new})
-    return [x for x in either if old.get(x) != new.get(x) and ((x in old and x in new) or x.endswith(".py"))]

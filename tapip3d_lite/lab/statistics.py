@@ -28,7 +28,7 @@ class Effect:
 
     Attributes:
         mean, low, high: with its 95 % interval; NaN where seeds or clips are too few.
-        p: of the mean under the hypothesis that the truth is 0.
+        p: of the mean under the hypothesis that the truth is 0; it is a little stricter than the interval.
         seen: the smallest difference that a study like this one finds in 80 % of the cases, by one comparison alone.
         seeds, clips: that count; clips where the score is undefined do not.
     """
@@ -62,7 +62,7 @@ def effect(values: ArrayLike, drawn: bool = True) -> Effect:
         return Effect(mean, seeds=seeds, clips=clips)
     squares = _mean_squares(values) if drawn else (0.0, values.var(ddof=1), 0.0)
     half, power = _half_width(0.05, squares, seeds, clips), _half_width(0.4, squares, seeds, clips)
-    p = _p_value(abs(mean), squares, seeds, clips)
+    p = float((_errors(squares, seeds, clips) >= abs(mean)).mean())
     return Effect(mean, mean - half, mean + half, p, half + power, seeds, clips)
 
 
@@ -92,13 +92,16 @@ def verdicts(effects: Sequence[Effect], level: float = 0.05) -> list[str]:
 
 
 def two_way_bootstrap(values: ArrayLike, n: int = 4000, seed: int = 0) -> tuple[float, float]:
-    """The 95 % percentile interval of the mean of (S, C) values when seeds and clips are both drawn again; no NaN.
+    """The 95 % percentile interval of the mean of (S, C) values when seeds and clips are both drawn again.
 
     With fewer than about eight seeds it is too narrow where seeds differ; it stands beside `effect` to show that.
     """
     values, rng = np.asarray(values, float), np.random.default_rng(seed)
+    values = values[:, ~np.isnan(values).any(0)]
+    if not values.size:
+        return math.nan, math.nan
     seeds, clips = (rng.multinomial(k, np.full(k, 1 / k), n) / k for k in values.shape)  # shares (n, S), (n, C)
-    low, high = np.quantile(np.einsum("ns,sc,nc->n", seeds, values, clips), [0.025, 0.975])
+    low, high = np.quantile(((seeds @ values) * clips).sum(1), [0.025, 0.975])
     return float(low), float(high)
 
 
@@ -113,27 +116,36 @@ def _mean_squares(values: np.ndarray) -> tuple[float, float, float]:
 def _half_width(level: float, squares: tuple[float, float, float], seeds: int, clips: int) -> float:
     """Half the width of the interval that misses the truth in a share `level` of the cases.
 
-    The mean of two approximations that err in opposite directions: Satterthwaite's is too narrow (93 %) where seeds and
-    clips count alike; each component with its own quantile of Student's t is too wide (97 %) where they do not.
+    A weighted mean of two approximations that err in opposite directions: Satterthwaite's, one Student's t for the whole
+    variance, holds 92 to 97 % where it should hold 95, and the draws of `_errors` 95 to 98 %.
     """
     a, b, e = squares
     if seeds == 1:
         return student(level, clips - 1) * math.sqrt(b / clips)
-    degrees = seeds - 1, clips - 1, (seeds - 1) * (clips - 1)
-    total, parts = max(a + b - e, 0.0), (max(a - e, 0.0), max(b - e, 0.0), e)
+    degrees, total = (seeds - 1, clips - 1, (seeds - 1) * (clips - 1)), max(a + b - e, 0.0)
     spread = sum(x**2 / df for x, df in zip(squares, degrees, strict=True))
-    common = student(level, total**2 / spread if spread else _MOST) * math.sqrt(total)
-    own = math.sqrt(sum(student(level, df) ** 2 * x for x, df in zip(parts, degrees, strict=True)))
-    return (common + own) / 2 / math.sqrt(seeds * clips)
+    common = student(level, total**2 / spread if spread else _MOST) * math.sqrt(total / seeds / clips)
+    return (2 * common + float(np.quantile(_errors(squares, seeds, clips), 1 - level))) / 3
 
 
-def _p_value(mean: float, squares: tuple[float, float, float], seeds: int, clips: int) -> float:
-    """The level whose interval just reaches 0, by bisection of its logarithm; at least 1e-6."""
-    low, high = math.log(1e-6), 0.0
-    for _ in range(18):
-        middle = (low + high) / 2
-        low, high = (low, middle) if _half_width(math.exp(middle), squares, seeds, clips) < mean else (middle, high)
-    return math.exp(high)
+def _errors(squares: tuple[float, float, float], seeds: int, clips: int) -> np.ndarray:
+    """Draws of |mean - truth|, given the mean squares: each could come from any variance that is plausible for it.
+
+    Deep in the tail, where Holm's correction looks, these alone are right: none of three seeds' variance may be there
+    by chance, and then only the draws know that it could be large.
+    """
+    normal, *plausible = _draws(seeds, clips)
+    a, b, e = (x * ratio for x, ratio in zip(squares, plausible, strict=True))
+    return normal * np.sqrt(np.maximum(a + b - e, 0.0) / (seeds * clips))
+
+
+@lru_cache(maxsize=32)
+def _draws(seeds: int, clips: int, count: int = 20_000) -> tuple[np.ndarray, ...]:
+    """|z|, and for each mean square the ratios of variances that are plausible to it; without drawn seeds 1."""
+    rng = np.random.default_rng(0)
+    degrees = [seeds - 1, clips - 1, (seeds - 1) * (clips - 1)]
+    ratios = [df / rng.chisquare(df, count) if df else np.ones(count) for df in degrees]
+    return np.abs(rng.normal(size=count)), *ratios
 
 
 def student(level: float, degrees: float) -> float:

@@ -16,7 +16,12 @@ from tapip3d_lite.validate import check_names
 JUDGED = ("APD3D_none_dynamic", "AJ3D_none")  # first, second
 Results = Mapping[str, Mapping[int, Mapping[str, Any]]]  # row → seed → what its file holds
 _TITLES = {"APD3D_none_dynamic": "APD3D, moving points", "AJ3D_none": "AJ3D"}
-_COSTS = {"parameters": "parameters (M)", "multiply_adds": "multiply-adds (M)", "step_ms": "step (ms)", "steps": "steps"}
+_COSTS = {
+    "parameters": "parameters (M)",
+    "multiply_adds": "multiply-adds (M)",
+    "step_ms": "step (ms)",
+    "steps": "steps",
+}
 
 
 @dataclass(frozen=True)
@@ -40,10 +45,13 @@ class Table:
         for metric in self.metrics:
             head += [_TITLES.get(metric, metric)]
             head += [f"minus {self.against}", "verdict"] if self.against else []
-        cells = [[row["row"], row["seeds"], *self._scores(row), *_cost_cells(row)] for row in self.rows]
+        cells = [
+            [row["row"], "–" if row["seeds"] is None else row["seeds"], *self._scores(row), *_cost_cells(row)]
+            for row in self.rows
+        ]
         if self.against:
-            seen = [[x for row in self.rows if (x := row[m].get("seen", math.nan)) == x] for m in self.metrics]
-            shown = [[f"{max(one):.3f}" if one else "–", "", ""][k] for one in seen for k in (1, 0, 2)]
+            seen = [[row[m]["difference"]["seen"] for row in self.rows if "difference" in row[m]] for m in self.metrics]
+            shown = [cell for one in seen for cell in ("", f"{max(one):.3f}" if one else "–", "")]
             cells.append(["smallest difference that each comparison would see", "", *shown, *[""] * len(_COSTS)])
         table = markdown_table([*head, *_COSTS.values()], [[str(cell) for cell in row] for row in cells])
         return "\n\n".join([table, *self.notes])
@@ -65,12 +73,11 @@ class Table:
         return _without_nan(asdict(self))
 
 
-def compare(results: Results, drawn: Mapping[str, bool], against: str | None, metrics: Sequence[str]) -> Table:
+def compare(results: Results, against: str | None, metrics: Sequence[str]) -> Table:
     """The table of some results.
 
     Args:
         results: of all rows, in their order.
-        drawn: which rows were trained, so that their seeds are drawn.
         against: the row that the others are compared with; None: none.
         metrics: that judge; one family, over which Holm's correction goes.
 
@@ -78,7 +85,7 @@ def compare(results: Results, drawn: Mapping[str, bool], against: str | None, me
         ValueError: an unknown row or metric, or no scores at all.
     """
     check_names("table: against", [] if against is None else [against], results)
-    scored = {row: {seed: x for seed, x in seeds.items() if "scores" in x} for row, seeds in results.items()}
+    scored = {name: _scored(seeds) for name, seeds in results.items()}
     known = {name for seeds in scored.values() for x in seeds.values() for one in x["scores"].values() for name in one}
     if not known:
         raise ValueError("table: no row has scores yet; run the study first")
@@ -86,35 +93,65 @@ def compare(results: Results, drawn: Mapping[str, bool], against: str | None, me
     rows, found = [], []
     for name, seeds in scored.items():
         failed = next((x["failed"] for x in results[name].values() if "failed" in x), None)
-        row = {"row": name, "seeds": len(seeds) if drawn[name] else 0, "failed": failed, **_costs(seeds)}
+        rows.append({"row": name, "seeds": len(seeds) if _drawn(seeds) else None, "failed": failed, **_costs(seeds)})
         for metric in metrics:
-            row[metric] = asdict(effect(matrix(seeds, metric), drawn[name])) if seeds else {"mean": math.nan}
-            if against not in (None, name) and seeds and scored[against]:
-                pair, is_drawn = _pair(scored, drawn, name, against, metric)
-                found.append((row[metric], paired(*pair, is_drawn), pair, is_drawn))
-        rows.append(row)
-    for (one, difference, pair, is_drawn), verdict in zip(found, verdicts([x[1] for x in found]), strict=True):
-        one |= {"difference": asdict(difference), "verdict": verdict, "seen": difference.seen}
-        gaps = pair[0] - pair[1]
-        gaps = gaps[:, ~np.isnan(gaps).any(0)]
-        one["bootstrap"] = two_way_bootstrap(gaps) if is_drawn and gaps.size else None
+            rows[-1][metric] = asdict(effect(_matrix(seeds, metric), _drawn(seeds)) if seeds else Effect(math.nan))
+            common = _common(seeds, scored.get(against, {}))
+            if name != against and common[0]:
+                found.append((rows[-1][metric], _drawn(seeds) or _drawn(scored[against])))
+                found[-1] += tuple(
+                    _matrix(x, metric, some) for x, some in zip((seeds, scored[against]), common, strict=True)
+                )
+    effects = [paired(ours, theirs, drawn) for _, drawn, ours, theirs in found]
+    for (one, drawn, ours, theirs), difference, verdict in zip(found, effects, verdicts(effects), strict=True):
+        one |= {"difference": asdict(difference), "verdict": verdict}
+        one["bootstrap"] = two_way_bootstrap(ours - theirs) if drawn else None
     return Table(rows, against, tuple(metrics), _notes(rows, results, against))
 
 
-def matrix(seeds: Mapping[int, Mapping[str, Any]], metric: str, some: Sequence[int] | None = None) -> np.ndarray:
+def gaps_by_clip(
+    results: Results, one: str, other: str, metric: str, seed: int | None = None
+) -> list[tuple[str, float]]:
+    """The clips with the difference of two rows, greatest first; the mean over seeds where none is named.
+
+    Raises:
+        ValueError: an unknown row, or rows that have no scores with the same seed.
+    """
+    check_names("row", (one, other), results)
+    both = [_scored(results[row]) for row in (one, other)]
+    pairs = [pair for pair in zip(*_common(*both), strict=True) if seed is None or seed in pair]
+    if not pairs:
+        raise ValueError(f"{one!r} and {other!r} have no scores with the same seed; run the study first")
+    means = [_matrix(x, metric, some).mean(0) for x, some in zip(both, zip(*pairs, strict=True), strict=True)]
+    names = sorted(both[0][pairs[0][0]]["scores"])
+    gaps = [(name, float(gap)) for name, gap in zip(names, means[0] - means[1], strict=True) if not math.isnan(gap)]
+    return sorted(gaps, key=lambda pair: -abs(pair[1]))
+
+
+def _scored(seeds: Mapping[int, Mapping[str, Any]]) -> dict[int, Mapping[str, Any]]:
+    return {seed: x for seed, x in seeds.items() if "scores" in x}
+
+
+def _drawn(seeds: Mapping[int, Mapping[str, Any]]) -> bool:
+    """Whether a row was trained, so that its seeds are drawn from many."""
+    return any(x["folder"] for x in seeds.values())
+
+
+def _common(one: Mapping[int, Any], other: Mapping[int, Any]) -> tuple[list[int], list[int]]:
+    """The seeds of each that are compared: equal ones; a tracker that was not trained stands beside every seed."""
+    if not one or not other:
+        return [], []
+    every = [sorted(x) if _drawn(x) else None for x in (one, other)]
+    trained = [set(x) for x in every if x is not None]
+    common = sorted(set.intersection(*trained)) if trained else [0]
+    return tuple(common if x is not None else [0] * len(common) for x in every)
+
+
+def _matrix(seeds: Mapping[int, Mapping[str, Any]], metric: str, some: Sequence[int] | None = None) -> np.ndarray:
     """A metric (S, C) of one row by seed and clip, in the order of their names; NaN where it is undefined."""
-    values = [[seeds[seed]["scores"][clip].get(metric) for clip in sorted(seeds[seed]["scores"])] for seed in some or seeds]
+    found = [seeds[seed]["scores"] for seed in (seeds if some is None else some)]
+    values = [[scores[clip].get(metric) for clip in sorted(scores)] for scores in found]
     return np.array([[math.nan if x is None else x for x in one] for one in values], float)
-
-
-def _pair(
-    scored: Results, drawn: Mapping[str, bool], one: str, other: str, metric: str
-) -> tuple[tuple[np.ndarray, np.ndarray], bool]:
-    """Scores of two rows on the seeds that both have, and whether these are drawn."""
-    common = [seed for seed in scored[one] if seed in scored[other] or not drawn[other]] if drawn[one] else None
-    common = [seed for seed in scored[other]] if common is None and drawn[other] else common
-    both = [matrix(scored[row], metric, common if drawn[row] else None) for row in (one, other)]
-    return tuple(both), drawn[one] or drawn[other]
 
 
 def _costs(seeds: Mapping[int, Mapping[str, Any]]) -> dict[str, float | None]:

@@ -65,9 +65,13 @@ class Variant:
         if not isinstance(name, str) or not name.strip():
             raise ValueError(f"Variant: expected a name, got {name!r}; it heads the row of the table")
         if tracker is not None and fields:
-            raise ValueError(f"Variant {name!r}: {tracker} is not trained, so {', '.join(fields)} cannot differ; use track")
+            raise ValueError(
+                f"Variant {name!r}: {tracker} is not trained, so {', '.join(fields)} cannot differ; use track"
+            )
         if own := sorted(set(fields) & _STUDY):
-            raise ValueError(f"Variant {name!r}: {', '.join(own)} must be equal in all rows; set it in the study's budget")
+            raise ValueError(
+                f"Variant {name!r}: {', '.join(own)} must be equal in all rows; set it in the study's budget"
+            )
         check_names(f"Variant {name!r}", fields, _TRACKER | _TRAIN)
         check_names(f"Variant {name!r}, track", track or {}, _TRACK | _TRACKER)
         values = {"name": name, "given": None if tracker is None else str(tracker), "fields": dict(fields)}
@@ -80,7 +84,9 @@ class Variant:
         tracker = {name: value for name, value in self.fields.items() if name in _TRACKER}
         changes = {name: value for name, value in self.fields.items() if name in _TRAIN}
         if "iterations" in tracker:
-            tracker["iterations"] = max(changes["iterations"]) if _pair(changes["iterations"]) else changes["iterations"]
+            tracker["iterations"] = (
+                max(changes["iterations"]) if _pair(changes["iterations"]) else changes["iterations"]
+            )
         for name, value in changes.items():
             part = getattr(base, name)
             if is_dataclass(part) and isinstance(value, Mapping):
