@@ -7,6 +7,7 @@ import importlib.util
 import json
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -77,8 +78,12 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
+@cache
 def source_code() -> dict[str, str]:
-    """Digests of the library's sources that scores depend on, without comments and docstrings, and versions of packages."""
+    """Digests of the library's sources that scores depend on, without comments and docstrings, and versions of packages.
+
+    They are read once, since a process keeps the code that it began with.
+    """
     found = {name: version(name) for name in ("torch", "numpy", "mujoco")}
     for path in sorted(_ROOT.rglob("*.py")):
         name = path.relative_to(_ROOT).as_posix()
