@@ -104,7 +104,7 @@ def test_diff_names_what_differs(study):
     found = lab.diff(*TWO)
     assert found == {"context": (None, "p2n")} and lab.diff(TINY.recipe, TINY.recipe) == {}
     assert lab.diff(TINY.recipe, replace(TINY.recipe, lr=1.0, loss=LossConfig(discount=0.1)))["lr"] == (1.5e-3, 1.0)
-    one, other, *_ = [x["folder"] for seeds in study.results().values() for x in seeds.values()]
+    one, other = [study.plan.store / "trainings" / x["training"] for x in study.results()["n2n"].values()]
     assert lab.diff(one, other) == {"seed": (0, 1)} and lab.diff(study.plan.folder, study.plan.folder) == {}
     with pytest.raises(ValueError, match="neither"):
         lab.diff(one, "nowhere")
@@ -150,7 +150,7 @@ def test_one_encoder_one_store_and_weights_that_rows_share(study):
         for name in (x for x in state if x.startswith("encoder.")):
             np.testing.assert_allclose(state[name].float(), shared[name].float(), atol=1e-3)  # stored in 16 bits
     found = study.results()
-    assert found["1 update"][1]["folder"] == found["n2n"][1]["folder"] and found["klt"][0]["folder"] is None
+    assert found["1 update"][1]["training"] == found["n2n"][1]["training"] and found["klt"][0]["training"] is None
     assert scores(study)["1 update"] != scores(study)["n2n"] and list(found["klt"]) == [0]
     other = lab.Study("x", [lab.Variant("wide", feature_dim=8)], budget="tiny").plan
     other.clips = study.plan.clips
@@ -301,7 +301,7 @@ def test_fewer_clips_than_needed(study, tmp_path):
 
 
 def test_equal_operations_are_turned_into_steps(store, tmp_path):
-    made = lab.Study(tmp_path / "flops", TWO, seeds=1, budget="tiny", flops=5e7, store=store)
+    made = lab.Study(tmp_path / "flops", TWO, seeds=1, budget="tiny", flops=1.5e8, store=store)
     assert made.run(progress=False)
     rows = {row["row"]: row for row in made.table().rows}
     assert 1 <= rows["n2n"]["steps"] < rows["p2n"]["steps"] < 100

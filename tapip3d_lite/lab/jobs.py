@@ -83,7 +83,7 @@ def do(job: Job, tell: Tell, stop: Stop) -> str:
         tracker = tracker_of(row, job.folder, job.device)
         scores = score(tracker, row, clips)
         costs = track_costs(tracker, clips[0], row.options()) | (step_costs(job.folder) if job.folder else {})
-        write_text(file, json.dumps({**facts, "costs": costs, "scores": scores}, indent=1) + "\n")
+        write_text(file, json.dumps({**facts, "device": job.device, "costs": costs, "scores": scores}, indent=1) + "\n")
     return "done"
 
 

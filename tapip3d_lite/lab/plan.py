@@ -164,7 +164,7 @@ class Plan:
             for row in self.rows.values() if seed == 0 else [row for row in self.rows.values() if row.given is None]:
                 job = self._training(row, seed, data, device)
                 key = self._key(row, job)
-                facts = {"key": key, "code": digest(json.dumps(self.code)), "folder": job.folder and str(job.folder)}
+                facts = {"key": key, "code": digest(json.dumps(self.code)), "training": job.folder and job.folder.name}
                 if is_scored(self.result(row, seed), key):
                     continue
                 job = found.get(job.folder or row.name, job)

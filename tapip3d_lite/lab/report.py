@@ -14,23 +14,37 @@ from matplotlib.figure import Figure
 from tapip3d_lite.evaluation.evaluate import markdown_table
 from tapip3d_lite.figures import png_bytes, save_png
 from tapip3d_lite.figures.comparisons import cost_figure, forest_figure
-from tapip3d_lite.figures.curves import learning_curves
+from tapip3d_lite.figures.curves import Line, learning_curves
 from tapip3d_lite.files import write_text
 from tapip3d_lite.lab.table import Results, Table, gaps_by_clip
-from tapip3d_lite.training.run_folder import read_log
 
 
-def write_report(folder: Path, table: Table, results: Results, plan: Mapping[str, Any], worst: int = 5) -> Path:
-    """Write `report.md`, `report.json` and figures into a folder; returns the first."""
+def write_report(
+    folder: Path,
+    table: Table,
+    results: Results,
+    logs: Mapping[str, Sequence[Line]],
+    plan: Mapping[str, Any],
+    worst: int = 5,
+) -> Path:
+    """Write `report.md`, `report.json` and figures into a folder; returns the first.
+
+    Args:
+        folder: made if missing.
+        table: of the results.
+        results: of all rows.
+        logs: of a training of each row, as far as there are any.
+        plan: what the study was made with.
+        worst: how many clips of each pair to list.
+    """
     metric = table.metrics[0]
     rows = [row for row in table.rows if not math.isnan(row[metric]["mean"])]
     figures = {"intervals": forest_figure({x["row"]: x[metric] for x in rows}, table.against, metric)}
     if any(row["multiply_adds"] for row in rows):
         points = {x["row"]: (x["multiply_adds"] / 1e6, x[metric]) for x in rows if x["multiply_adds"]}
         figures["costs"] = cost_figure(points, "multiply-adds for each query and frame (M)", metric)
-    logs = {name: _log(seeds) for name, seeds in results.items()}
-    if any(logs.values()):
-        figures["curves"] = learning_curves([(name, log) for name, log in logs.items() if log])
+    if logs:
+        figures["curves"] = learning_curves(list(logs.items()))
     gaps = {x["row"]: gaps_by_clip(results, x["row"], table.against, metric) for x in rows if x["row"] != table.against}
     cells = [[name, *(f"{clip} {gap:+.3f}" for clip, gap in some[:worst])] for name, some in gaps.items()]
     head = [f"minus {table.against}", *(f"{rank + 1}." for rank in range(max([len(x) - 1 for x in cells], default=0)))]
@@ -46,12 +60,6 @@ def write_report(folder: Path, table: Table, results: Results, plan: Mapping[str
     write_text(folder / "report.json", json.dumps(content, indent=1) + "\n")
     write_text(folder / "report.md", "\n\n".join(parts) + "\n")
     return folder / "report.md"
-
-
-def _log(seeds: Mapping[int, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The log of a row's first training, if its folder is still there."""
-    folder = next((x["folder"] for x in seeds.values() if x.get("folder") and "scores" in x), None)
-    return read_log(folder) if folder and (Path(folder) / "log.jsonl").exists() else []
 
 
 def explorer(rows: Sequence[str], seeds: int, clips: int, draw: Callable[..., Figure]) -> widgets.Widget:

@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures.comparisons import where_they_differ
 from tapip3d_lite.files import write_text
-from tapip3d_lite.lab.budgets import BUDGETS, Budget, judged_clip
+from tapip3d_lite.lab.budgets import BUDGETS, Budget, Data, judged_clip
 from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.lab.jobs import STOPPED, Job, do_all, tracker_of
 from tapip3d_lite.lab.plan import Plan, is_scored, read_json
@@ -29,6 +29,7 @@ from tapip3d_lite.lab.report import explorer, write_report
 from tapip3d_lite.lab.table import JUDGED, Table, compare, gaps_by_clip
 from tapip3d_lite.lab.train import interruptible
 from tapip3d_lite.lab.variant import Variant
+from tapip3d_lite.training.run_folder import read_log
 from tapip3d_lite.validate import check_names
 
 
@@ -103,6 +104,7 @@ class Study:
         store = Path(store) if store else folder / "store"
         self.plan = Plan(folder, store, dict(zip(names, rows, strict=True)), seeds, budget, limit, data)
         self.plan.check_rows()
+        self._data: Data | None = None
         if old is not None:
             self.plan.take_over(old, accept_code)
 
@@ -170,17 +172,27 @@ class Study:
 
         Returns the Markdown file. ValueError as for `table`.
         """
-        return write_report(Path(folder), self.table(against), self.results(), self.plan.to_dict())
+        table, results, trainings = self.table(against), self.results(), self.plan.store / "trainings"
+        first = {
+            name: next((x["training"] for x in seeds.values() if "scores" in x), None)
+            for name, seeds in results.items()
+        }
+        logs = {
+            name: trainings / one for name, one in first.items() if one and (trainings / one / "log.jsonl").exists()
+        }
+        logs = {name: read_log(one) for name, one in logs.items()}
+        return write_report(Path(folder), table, results, logs, self.plan.to_dict())
 
     def tracks(self, row: str, clip: str, seed: int = 0) -> tuple[Clip, Tracks]:
         """A held-out clip as a row saw it, and the row's tracks; ValueError where these were not scored."""
         found = self.results().get(row, {}).get(seed, {})
         if clip not in found.get("scores", {}):
             raise ValueError(f"Study: row {row!r} has no scores of {clip!r} with seed {seed}; run the study first")
-        variant, paths = self.plan.rows[row], self.plan.find_clips(1, False).held_out
-        index = next(i for i, path in enumerate(paths) if path.stem == clip)
-        seen = under(judged_clip(paths[index], self.plan.budget), variant.degrade, index)
-        return seen, tracker_of(variant, found["folder"]).track(seen, **variant.options())
+        self._data = self._data or self.plan.find_clips(1, False)
+        index, path = next((i, path) for i, path in enumerate(self._data.held_out) if path.stem == clip)
+        variant, training = self.plan.rows[row], found["training"] and self.plan.store / "trainings" / found["training"]
+        seen = under(judged_clip(path, self.plan.budget), variant.degrade, index)
+        return seen, tracker_of(variant, training).track(seen, **variant.options())
 
     def draw(self, one: str, other: str, rank: int = 0, seed: int = 0, metric: str = JUDGED[0]) -> Figure:
         """The track on which two rows differ most, in the clip on which they do, or in the next ones (`rank` 1, 2, …)."""

@@ -134,7 +134,7 @@ def _scored(seeds: Mapping[int, Mapping[str, Any]]) -> dict[int, Mapping[str, An
 
 def _drawn(seeds: Mapping[int, Mapping[str, Any]]) -> bool:
     """Whether a row was trained, so that its seeds are drawn from many."""
-    return any(x["folder"] for x in seeds.values())
+    return any(x["training"] for x in seeds.values())
 
 
 def _common(one: Mapping[int, Any], other: Mapping[int, Any]) -> tuple[list[int], list[int]]:
