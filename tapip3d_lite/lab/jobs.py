@@ -105,7 +105,8 @@ def _trained(job: Job, tell: Tell, stop: Stop) -> bool:
             trainer.run(halt, progress=False)
         if first and not trainer.schedule.matching:
             save_weights(trainer.average, weights)
-    tell(job.steps)
+    if weights.exists():
+        tell(job.steps)
     return weights.exists()
 
 

@@ -50,7 +50,10 @@ class Table:
             for row in self.rows
         ]
         if self.against:
-            seen = [[row[m]["difference"]["seen"] for row in self.rows if "difference" in row[m]] for m in self.metrics]
+            found = [
+                [row[m]["difference"]["seen"] for row in self.rows if "difference" in row[m]] for m in self.metrics
+            ]
+            seen = [[x for x in one if not math.isnan(x)] for one in found]
             shown = [cell for one in seen for cell in ("", f"{max(one):.3f}" if one else "–", "")]
             cells.append(["smallest difference that each comparison would see", "", *shown, *[""] * len(_COSTS)])
         table = markdown_table([*head, *_COSTS.values()], [[str(cell) for cell in row] for row in cells])
