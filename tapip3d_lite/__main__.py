@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tqdm import tqdm
@@ -229,6 +229,36 @@ def curves(
     print(f"wrote {out}")
 
 
+def lab(
+    action: Positional[Annotated[Literal["run", "table", "report", "list"], arg(help="what to do with the study")]],
+    study: Positional[Annotated[str | None, arg(help="TOML or JSON file, folder, or a table of the paper")]] = None,
+    /,
+    jobs: Annotated[int, arg(help="trainings at once (run)")] = 1,
+    device: Annotated[str, arg(help="cpu or cuda (run)")] = "cpu",
+    against: Annotated[str | None, arg(help="the row that others are compared with")] = None,
+    metric: Annotated[tuple[str, ...], arg(help="that judge, the first one first")] = (
+        "APD3D_none_dynamic",
+        "AJ3D_none",
+    ),
+    out: Annotated[Path, arg(help="folder (report)")] = Path("report"),
+    accept_code: Annotated[bool, arg(help="go on with results of other code")] = False,
+) -> None:
+    """Run a study of rows under equal conditions; its table, its report, its rows, or the paper's tables by name."""
+    from tapip3d_lite.lab.papers import TABLES, listed, open_study
+
+    if study is None:
+        print("\n".join(f"{name}: {', '.join(values['rows'])}" for name, values in TABLES.items()))
+        return
+    opened, base = open_study(study, accept_code)
+    if action == "run" and not opened.run(jobs, device):
+        print("stopped and saved; the same command goes on")
+        sys.exit(130)
+    if action == "report":
+        print(f"wrote {opened.report(out, against or base)}")
+    else:
+        print(listed(opened) if action == "list" else opened.table(against or base, metric))
+
+
 def import_(checkpoint: Positional[Path], out: Positional[Path], /) -> None:
     """Convert the authors' checkpoint (.pth) to a weights file of ours (.safetensors)."""
     tracker = t3d.load_official(checkpoint)
@@ -237,7 +267,7 @@ def import_(checkpoint: Positional[Path], out: Positional[Path], /) -> None:
     print(f"wrote {out}: {count / 1e6:.2f} M parameters; use it with --tracker {out}")
 
 
-_FUNCTIONS = (track, evaluate, benchmark, demo, check, convert, simulate, train, card, curves, import_)
+_FUNCTIONS = (track, evaluate, benchmark, demo, check, convert, simulate, train, card, curves, lab, import_)
 COMMANDS = {function.__name__.rstrip("_"): function for function in _FUNCTIONS}
 
 

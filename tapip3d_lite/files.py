@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
@@ -219,3 +220,11 @@ def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray | None]) -> None:
 def shipped_weights() -> dict[str, Path]:
     """The weights files that come with the library, by name."""
     return {path.stem: path for path in (Path(__file__).parent / "weights").glob("*.safetensors")}
+
+
+def digest(*contents: bytes | str) -> str:
+    """Twelve letters that identify some contents."""
+    total = hashlib.sha256()
+    for content in contents:
+        total.update(content.encode() if isinstance(content, str) else content)
+    return total.hexdigest()[:12]

@@ -50,18 +50,8 @@ def read_saved(path: str | Path) -> Any:
 
 
 class _Reader(Machine):
-    recorded = [
-        "omegaconf",
-        "box",
-        "typing",
-        "pathlib",
-        "argparse",
-        "addict",
-        "easydict",
-        "munch",
-        "yacs",
-        "ml_collections",
-    ]
+    recorded = ("omegaconf", "box", "typing", "pathlib", "argparse", "addict", "easydict", "munch", "yacs")
+    recorded += ("ml_collections",)
     known = Machine.known | {
         "torch": {"Size", "device", *_DTYPES, *_STORAGES},
         "torch._utils": {"_rebuild_tensor", "_rebuild_tensor_v2", "_rebuild_parameter"},

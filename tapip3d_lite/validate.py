@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import difflib
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import fields
 from numbers import Integral, Real
 from typing import TYPE_CHECKING
@@ -145,3 +146,12 @@ def check_state(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
             raise ValueError(
                 f"parameter {name} is not finite: its training failed, or the file is damaged; use another one"
             )
+
+
+def check_names(where: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Raise ValueError for the first name that is not known; it says which known ones are near."""
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, sorted(known), 3, 0.5)
+            hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(sorted(known))}"
+            raise ValueError(f"{where}: no {name!r}; {hint}")

@@ -5,6 +5,7 @@ gives with a value other than its default, and a flag that stands in no line bel
 """
 
 import inspect
+import json
 import sys
 import time
 from dataclasses import asdict, replace
@@ -205,6 +206,8 @@ def lines(sample, folder):
         train_encoder=True, augment=True, init="lite", tracker={},
     ).to_dict()  # fmt: skip
     run, results = folder / "run", folder / "results.json"
+    rows = {name: {"tracker": name} for name in ("static", "klt")}
+    (folder / "own.json").write_text(json.dumps({"rows": rows, "budget": "tiny"}))
     train = ["train", "--out", run, "--data", folder / "clips", "--device", "cpu", "--workers", 0, "--no-compiled"]
     return [
         ["convert", sample, folder / "images", "--format", "npz"],
@@ -223,6 +226,8 @@ def lines(sample, folder):
         ["card", run, results, "--hardware", "a core", "--out", folder / "CARD.md", "--name", "mine",
          "--weights", run / "weights.safetensors", "--command", "train", "--allow", "mine",
           "--also", Path(__file__).parents[1] / "README.md"],
+        ["lab", "run", folder / "own.json", "--jobs", 1, "--device", "cpu", "--accept-code"],
+        ["lab", "report", folder / "runs" / "own", "--against", "klt", "--metric", "OA", "--out", folder / "report"],
         ["curves", run, run / "log.jsonl", "--out", folder / "curves.png", "--by", "minutes"],
     ]  # fmt: skip
 

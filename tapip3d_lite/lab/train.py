@@ -53,7 +53,7 @@ def make_trainer(
         config: the recipe.
         clips: training clips (npz files with tracks) of any image size.
         validation: held-out clips with true tracks; none: the tracker is not scored.
-        options: of `Trainer`: `device`, `resume`, `workers`, `compiled`.
+        options: of `Trainer`: `device`, `resume`, `workers`, `compiled`, `encoder`.
 
     Raises:
         ValueError: as `Trainer` does.

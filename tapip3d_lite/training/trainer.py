@@ -60,6 +60,7 @@ class Trainer:
         resume: bool = False,
         workers: int = 0,
         compiled: bool = False,
+        encoder: str | Path | None = None,
     ) -> None:
         """Start a training, or continue one.
 
@@ -73,6 +74,8 @@ class Trainer:
             resume: continue from the folder's checkpoint, if there is one.
             workers: processes that make examples ahead of time; for a GPU, which would otherwise wait for them.
             compiled: compile the tracker's parts, which takes minutes and then makes each step faster (GPU).
+            encoder: folder of a training whose encoder is taken over; the features of a frozen one are stored there, for
+                all trainings that share it.
 
         Raises:
             ValueError: no clips, or unusable ones; the folder holds a training already (without `resume`) or one of
@@ -93,11 +96,17 @@ class Trainer:
         if config.init is not None:
             self.tracker.load_state_dict(initial_weights(config))
         self.folder = RunFolder(folder, config, resume)
+        source = self.folder.path if encoder is None else Path(encoder)
+        if encoder is not None:
+            stored, own = read_weights(source / "weights.safetensors")[0], self.tracker.encoder.state_dict()
+            stored = {name: stored[f"encoder.{name}"] for name in own if f"encoder.{name}" in stored}
+            check_state(stored, own)
+            self.tracker.encoder.load_state_dict(stored)
         self.group, self.step, self.seconds = Group(device), 0, 0.0
         self._on_gpu, cache = torch.device(device).type == "cuda", None
         if not config.train_encoder and not self._on_gpu:
             size = self.tracker.config.image_size
-            cache = FeatureCache(self.folder.path / "features", self.tracker.encoder, size)
+            cache = FeatureCache(source / "features", self.tracker.encoder, size)
             cache.check_room(clips)
         self.examples = Examples(config, clips, self.group.rank, cache)
         with self.folder.locked() if self.group.is_main else nullcontext():

@@ -1,0 +1,79 @@
+"""Studies by name, as plain values that a TOML or JSON file could hold; and studies from such files."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tapip3d_lite.lab.study import Study
+from tapip3d_lite.lab.variant import Variant
+from tapip3d_lite.validate import check_names
+
+TABLES: dict[str, dict[str, Any]] = {
+    "n2n": {"rows": {"n2n": {}, "p2n": {"context": "p2n"}}, "against": "n2n"},
+}
+"""The paper's tables: `rows` by name, each with the arguments of `Variant`; `against`, and other arguments of `Study`."""
+
+_FIELDS = ("folder", "rows", "against", "seeds", "budget", "steps", "minutes", "flops", "store", "data")
+
+
+def open_study(source: str | Path, accept_code: bool = False) -> tuple[Study, str | None]:
+    """A study, and the row that others are compared with, from a name of `TABLES`, a TOML or JSON file, or a folder.
+
+    A file's `folder`, `store` and `data` are relative to it; without a `folder` the study is in `runs/<name>`.
+
+    Raises:
+        ValueError: neither of these, an unreadable file, unknown fields, or what `Study` refuses.
+    """
+    path = Path(source)
+    if (path / "study.json").exists():
+        return Study(path, accept_code=accept_code), None
+    if path.suffix not in (".toml", ".json"):
+        check_names(
+            "lab: neither a file (.toml, .json), nor a study's folder, nor a table of the paper", [str(source)], TABLES
+        )
+        values, home = TABLES[str(source)], Path()
+        values = {"store": "runs/store", **values}
+    else:
+        values, home = _parsed(path), path.parent
+    check_names(str(source), values, _FIELDS)
+    rows = values.get("rows", {})
+    if not isinstance(rows, Mapping) or not all(isinstance(row, Mapping) for row in rows.values()):
+        raise ValueError(f"{source}: expected rows by name, e.g. [rows.p2n] with context = 'p2n' below, got {rows!r}")
+    kept = {k: v for k, v in values.items() if k in ("seeds", "budget", "steps", "minutes", "flops")}
+    if "store" in values:
+        kept["store"] = home / values["store"]
+    if "data" in values:
+        kept["data"] = tuple(home / one for one in values["data"])
+    folder = home / values.get("folder", Path("runs") / path.stem)
+    study = Study(folder, [Variant(name, **row) for name, row in rows.items()], **kept, accept_code=accept_code)
+    return study, values.get("against")
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".json":
+            return json.loads(text)
+        if sys.version_info < (3, 11):
+            raise ValueError(f"TOML needs Python 3.11, this is {sys.version.split()[0]}; write the same as JSON")
+        import tomllib
+
+        return tomllib.loads(text)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: not readable: {error}") from error
+
+
+def listed(study: Study) -> str:
+    """Each row with what it sets, and which of its seeds are finished or why it failed; one line a row."""
+    lines = []
+    for name, seeds in study.results().items():
+        row, states = study.plan.rows[name], {seed: x.get("failed", "finished") for seed, x in seeds.items()}
+        wanted = range(study.plan.seeds) if row.given is None else [0]
+        done = sum(state == "finished" for state in states.values())
+        failed = next((f"; failed: {state}" for state in states.values() if state != "finished"), "")
+        lines.append(f"{name}: {json.dumps(row.to_dict())}, {done} of {len(wanted)} seeds{failed}")
+    return "\n".join(lines)

@@ -1,0 +1,211 @@
+"""`Plan`: what a study consists of, kept in its `study.json`; and the jobs that follow from it, keyed by content.
+
+store/clips/<scene>/         to train on, to watch trainings by, to be judged by
+store/encoders/<key>/        pretrained by matching, with the stored features of the clips
+store/trainings/s0-<key>/    of a recipe with seed 0; rows and studies with the same recipe share it
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from tapip3d_lite.files import digest, read_json, write_text
+from tapip3d_lite.lab.budgets import Budget, Data, own_clips, simulated
+from tapip3d_lite.lab.jobs import Job, probe
+from tapip3d_lite.lab.provenance import diff, own_code, source_code
+from tapip3d_lite.lab.variant import Variant
+from tapip3d_lite.training.recipe import TrainConfig
+
+_ENCODER = ("feature_dim", "stride", "center_rgb", "image_size")  # fields that the encoder, or its input, depends on
+_MATCHING = (
+    "preset",
+    "clips",
+    "matching_steps",
+    "matching",
+    "frames",
+    "sampling",
+    "precision",
+    "average",
+    "warmup",
+    "seed",
+)
+
+
+@dataclass
+class Plan:
+    """What a study was made with; everything but rows, seeds and steps stays as it was.
+
+    Attributes:
+        folder, store: of the study, and of what it can share.
+        rows: by name.
+        seeds: number of trainings of each row.
+        budget: what rows have in common.
+        limit: `{"minutes": …}` or `{"flops": …}`, where not the number of steps is equal.
+        data: two folders of clips of one's own, or None.
+        code: digests of the sources.
+        clips: digests of the clips, once there are some.
+        steps: by recipe, where the limit determines them.
+    """
+
+    folder: Path
+    store: Path
+    rows: dict[str, Variant]
+    seeds: int
+    budget: Budget
+    limit: dict[str, float]
+    data: list[str] | None
+    code: dict[str, str] = field(default_factory=source_code)
+    clips: dict[str, str] | None = None
+    steps: dict[str, int] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as `study.json` holds them."""
+        rows = {name: row.to_dict() for name, row in self.rows.items()}
+        kept = {name: getattr(self, name) for name in ("seeds", "limit", "data", "clips", "steps", "code")}
+        return {"rows": rows, "budget": self.budget.to_dict(), **kept}
+
+    def check_rows(self) -> None:
+        """Raise ValueError for a row that cannot be built."""
+        for row in self.rows.values():
+            if row.given is None:
+                row.recipe(self.budget.recipe)
+
+    def take_over(self, old: Mapping[str, Any], accept_code: bool) -> None:
+        """Refuse (ValueError) an old plan that differs in what must be equal; take over what it knows."""
+        ours, rows = self.to_dict(), [name for name in self.rows if name in old["rows"]]
+        one, other = (
+            {**{k: x[k] for k in ("budget", "limit", "data")}, "rows": {n: x["rows"][n] for n in rows}}
+            for x in (old, ours)
+        )
+        if found := diff(one, other):
+            text = ", ".join(f"{name}={a!r} (now {b!r})" for name, (a, b) in found.items())
+            raise ValueError(
+                f"Study: {self.folder} was made otherwise: {text}; use its values, other names or another folder"
+            )
+        changed = diff(old["code"], self.code)
+        if changed and not accept_code:
+            raise ValueError(
+                f"Study: {self.folder} was made by other code: {', '.join(changed)} differ; use that code or another folder, or "
+                "accept_code=True, which keeps its results and goes on"
+            )
+        self.clips, self.steps = old["clips"], old["steps"]
+
+    def save(self) -> None:
+        """Write `study.json`; rows and seeds that only an older plan has stay in it."""
+        values, file = self.to_dict(), self.folder / "study.json"
+        if file.exists():
+            old = read_json(file)
+            values |= {"rows": {**old["rows"], **values["rows"]}, "seeds": max(old["seeds"], self.seeds)}
+        write_text(file, json.dumps(values, indent=1) + "\n")
+
+    def find_clips(self, processes: int, progress: bool) -> Data:
+        """The clips, simulated where they are missing; ValueError where an old study had others."""
+        if self.data:
+            data = own_clips(*map(Path, self.data), self.budget)
+        else:
+            data = simulated(self.store / "clips" / self.budget.scene.__name__, self.budget, processes, progress)
+        found = {name: digest(*(path.read_bytes() for path in paths)) for name, paths in asdict(data).items()}
+        if self.clips not in (None, found):
+            changed = ", ".join(diff(self.clips, found))
+            raise ValueError(
+                f"Study: clips differ from those that {self.folder} was made with: {changed}; use another folder"
+            )
+        self.clips = found
+        self.save()
+        return data
+
+    def recipe(self, row: Variant, seed: int = 0) -> TrainConfig:
+        """What is trained for a row and seed, given an encoder."""
+        recipe = replace(row.recipe(self.budget.recipe), seed=seed, matching_steps=0)
+        return replace(recipe, steps=self.steps.get(_any_seed(recipe), recipe.steps))
+
+    def encoders(self, data: Data, device: str) -> list[Job]:
+        """The encoders that are still to be trained."""
+        found = {job.folder: job for row in self.rows.values() if (job := self._encoder(row, data, device))}
+        return [job for folder, job in found.items() if not (folder / "weights.safetensors").exists()]
+
+    def _encoder(self, row: Variant, data: Data | None, device: str) -> Job | None:
+        """The training of a row's encoder, which is every row's unless their sizes differ; None for a given tracker."""
+        if row.given is not None:
+            return None
+        base, wanted = self.budget.recipe, row.recipe(self.budget.recipe)
+        sizes = {name: wanted.tracker[name] for name in _ENCODER if name in wanted.tracker}
+        kept = {name: getattr(base, name) for name in _MATCHING}
+        recipe = TrainConfig(**kept, tracker={**base.tracker, **sizes}, steps=1, validation=0).to_dict()
+        folder = self.store / "encoders" / digest(json.dumps(recipe), self.clips["train"])
+        return Job("the encoder", folder, recipe, None, (), data, self.budget.to_dict(), device)
+
+    def divide(self, data: Data, device: str) -> None:
+        """Where rows have time or operations in common: find the steps that each may make; ValueError where it is none."""
+        for row in self.rows.values() if self.limit else ():
+            if row.given is not None or (key := _any_seed(self.recipe(row))) in self.steps:
+                continue
+            with tempfile.TemporaryDirectory(dir=self.folder) as folder:
+                seconds, flops = probe(self._training(row, 0, data, device), Path(folder))
+            steps = int(self.limit["flops"] / flops if "flops" in self.limit else 60 * self.limit["minutes"] / seconds)
+            if steps < 1:
+                need = f"{seconds / 60:.2g} minutes and {flops:.2g} operations"
+                raise ValueError(
+                    f"Study: a step of row {row.name!r} takes {need}; no step fits into {self.limit}; give more"
+                )
+            self.steps[key] = steps
+            self.save()
+
+    def trainings(self, data: Data, device: str) -> list[Job]:
+        """All that is still to be trained and scored, seed by seed; rows of one recipe share a job."""
+        found: dict[Any, Job] = {}
+        for seed in range(self.seeds):
+            for row in self.rows.values() if seed == 0 else [row for row in self.rows.values() if row.given is None]:
+                job = self._training(row, seed, data, device)
+                key = self._key(row, job)
+                facts = {"key": key, "code": digest(json.dumps(self.code)), "training": job.folder and job.folder.name}
+                if is_scored(self.result(row, seed), key):
+                    continue
+                job = found.get(job.folder or row.name, job)
+                rows = (*job.rows, ({"name": row.name, **row.to_dict()}, self.result(row, seed), facts))
+                found[job.folder or row.name] = replace(job, rows=rows)
+        return list(found.values())
+
+    def _training(self, row: Variant, seed: int, data: Data | None = None, device: str = "cpu") -> Job:
+        """The training of a row with a seed, without what is scored by it."""
+        if row.given is not None:
+            return Job(row.name, None, None, None, (), data, self.budget.to_dict(), device)
+        recipe, encoder = self.recipe(row, seed).to_dict(), self._encoder(row, data, device).folder
+        key = digest(json.dumps([recipe, own_code(recipe)]), encoder.name, self.clips["train"])
+        folder = self.store / "trainings" / f"s{seed}-{key}"
+        return Job(f"{row.name} s{seed}", folder, recipe, encoder, (), data, self.budget.to_dict(), device)
+
+    def _key(self, row: Variant, job: Job) -> str:
+        """What a row's scores depend on."""
+        given = Path(row.given).read_bytes() if row.given and Path(row.given).is_file() else str(row.given)
+        parts = json.dumps([row.to_dict(), self.clips, own_code(row.to_dict())])
+        return digest(parts, given, job.folder.name if job.folder else "")
+
+    def result(self, row: Variant, seed: int) -> Path:
+        """The file of a row's scores."""
+        return self.folder / "results" / f"{quote(row.name, safe=' =,+()')} s{seed}.json"
+
+    def results(self) -> dict[str, dict[int, dict[str, Any]]]:
+        """What the files of results hold, by row and seed, without those of an earlier state of the row."""
+        found = {}
+        for name, row in self.rows.items():
+            files = {s: file for s in range(self.seeds) if (file := self.result(row, s)).exists()}
+            held = {s: read_json(file) for s, file in files.items()}
+            found[name] = {s: x for s, x in held.items() if x["key"] == self._key(row, self._training(row, s))}
+        return found
+
+
+def is_scored(file: Path, key: str) -> bool:
+    """Whether a file holds scores with that key."""
+    one = read_json(file) if file.exists() else {}
+    return "scores" in one and one["key"] == key
+
+
+def _any_seed(recipe: TrainConfig) -> str:
+    return digest(json.dumps({**recipe.to_dict(), "steps": 0, "seed": 0}))

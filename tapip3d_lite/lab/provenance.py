@@ -1,0 +1,110 @@
+"""Where results come from: configs in plain values, digests of the code, and what differs between two of either."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from tapip3d_lite.files import digest
+
+_ROOT = Path(__file__).parents[1]
+_UNSEEN = (
+    "figures",
+    "lab",
+    "__main__",
+    "official",
+    "checkpoint_reader",
+    "recorder",
+    "check",
+    "export",
+)  # change no score
+_SEEN = ("lab/conditions.py", "lab/jobs.py")
+
+
+def plain(value: Any) -> Any:
+    """What JSON cannot hold: a dataclass as a dictionary, a class or function as `"module:name"`."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "__qualname__"):
+        return f"{value.__module__}:{value.__qualname__}"
+    raise ValueError(
+        f"{value!r} has no name by which another process could find it; give a class or function of a module"
+    )
+
+
+def own_code(values: Any) -> dict[str, str]:
+    """Digests of the source files of the custom parts, `"module:name"`, that plain values name; `__main__` has none."""
+    if isinstance(values, Mapping | list | tuple):
+        found = [own_code(x) for x in (values.values() if isinstance(values, Mapping) else values)]
+        return {name: code for one in found for name, code in one.items()}
+    module, _, name = values.partition(":") if isinstance(values, str) else ("", "", "")
+    if not name.isidentifier() or module == "__main__":
+        return {}
+    try:
+        origin = importlib.util.find_spec(module).origin
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{values}: no module {module!r}; run where it can be imported") from error
+    return {module: digest(Path(origin).read_bytes())}
+
+
+def diff(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:
+    """What differs between two configs: dotted names with both values, None where a value is missing.
+
+    Args:
+        one, other: `Variant`, `TrainConfig`, `TrackerConfig`, dictionaries, or folders of trainings or studies.
+
+    Raises:
+        ValueError: a folder without a config.
+    """
+    a, b = _flat(_config(one)), _flat(_config(other))
+    return {name: (a.get(name), b.get(name)) for name in {**a, **b} if a.get(name) != b.get(name)}
+
+
+def _config(source: Any) -> Any:
+    if isinstance(source, str | Path):
+        for name in ("config.json", "study.json"):
+            if (path := Path(source) / name).exists():
+                return json.loads(path.read_text(encoding="utf-8"))
+        raise ValueError(
+            f"diff: {source} holds neither config.json nor study.json; give a training's or study's folder"
+        )
+    return source.to_dict() if hasattr(source, "to_dict") else json.loads(json.dumps(source, default=plain))
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found = {}
+    for name, value in values.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return found
+
+
+@cache
+def source_code() -> dict[str, str]:
+    """Digests of the library's sources that scores depend on, without comments and docstrings, and versions of packages.
+
+    They are read once, since a process keeps the code that it began with.
+    """
+    found = {name: version(name) for name in ("torch", "numpy", "mujoco")}
+    for path in sorted(_ROOT.rglob("*.py")):
+        name = path.relative_to(_ROOT).as_posix()
+        if name.removesuffix(".py").split("/")[0] not in _UNSEEN or name in _SEEN:
+            found[name] = digest(_spoken(path.read_text(encoding="utf-8")))
+    return found
+
+
+def _spoken(source: str) -> str:
+    """A source's syntax tree without docstrings, so that only a change of what it does changes the text."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            node.body = node.body[1:]
+    return ast.dump(tree)
