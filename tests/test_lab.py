@@ -208,7 +208,7 @@ def test_stop_saves_and_the_next_call_goes_on(study, store, tmp_path):
 def test_a_row_that_fails_is_marked_and_the_others_go_on(store, tmp_path):
     rows = [lab.Variant("static", tracker="static"), lab.Variant("missing", tracker="none.safetensors")]
     rows += [
-        lab.Variant("explodes", lr=1e30),
+        lab.Variant("explodes", loss={"visibility": 1e299}),
         lab.Variant("half way", tracker="klt", degrade="tests.lab_conditions:broken"),
     ]
     made = lab.Study(tmp_path / "study", rows, seeds=1, budget="tiny", store=store)
@@ -291,11 +291,9 @@ def test_bad_plans_are_refused(tmp_path, arguments, message):
         lab.Study(tmp_path, **({"rows": TWO} | arguments))
 
 
-def test_fewer_clips_than_needed(study, tmp_path):
-    data = study.plan.find_clips(1, False)
-    own = {"data": (data.train[0].parent, data.watched[0].parent), "budget": "tiny"}
-    with pytest.raises(ValueError, match="holds 1 clips, 4 are needed"):
-        lab.Study(tmp_path, TWO, **own).run(progress=False)
+def test_more_clips_than_there_are(study, tmp_path):
+    with pytest.raises(ValueError, match=r"held_out: expected 2 to \d+ clips"):
+        replace(TINY, held_out=10**6)
     with pytest.raises(ValueError, match="expected at least one job"):
         study.run(jobs=0)
 
@@ -398,7 +396,7 @@ def test_the_tables_of_the_paper_have_names(monkeypatch, capsys, tmp_path):
         ({"rows": {"a": {"contxt": "p2n"}}}, "did you mean context"),
         ({"rowz": {}}, "did you mean rows"),
         ({"rows": ["a"]}, "rows by name"),
-        ("{", "not readable"),
+        ("{", "not a readable JSON file"),
     ],
 )
 def test_a_bad_file_is_one_line_and_exit_code_2(tmp_path, monkeypatch, capsys, content, message):

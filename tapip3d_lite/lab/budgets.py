@@ -31,7 +31,7 @@ def lab_scene(seed: int) -> SimulationConfig:
 
 def tiny_scene(seed: int) -> SimulationConfig:
     """A third of a second in 32 x 32 pixels."""
-    return SimulationConfig(frames=8, fps=24.0, size=(32, 32), tracks=48, camera=("static", "arc")[seed % 2])
+    return replace(lab_scene(seed), frames=8, size=(32, 32), tracks=48)
 
 
 @dataclass(frozen=True)
@@ -87,31 +87,19 @@ _TINY = {
     "time_depth": 1, "space_depth": 1, "virtual_tracks": 4,
 }  # fmt: skip
 _FOCUSED = {  # all of the steps go into the world frame and into perfect depth
-    "motion": MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0),
-    "sensor": 0.0,
-    "lr": 1.5e-3,
-    "iterations": 2,
-}
+    "motion": MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0), "sensor": 0.0, "lr": 1.5e-3, "iterations": 2,
+}  # fmt: skip
 _LAB_STEPS = {
-    "clips": 240,
-    "matching_steps": 600,
-    "steps": 1500,
-    "average": 150,
-    "evaluate_every": 250,
-    "validation": 8,
-}
-_TINY_STEPS = {"clips": 4, "matching_steps": 4, "steps": 12, "average": 4, "evaluate_every": 6, "validation": 1}
+    "clips": 240, "matching_steps": 600, "steps": 1500, "average": 150, "evaluate_every": 250, "validation": 8,
+    "frames": 8, "sampling": SamplingConfig(tracks=48),
+}  # fmt: skip
+_TINY_STEPS = {
+    "clips": 4, "matching_steps": 4, "steps": 12, "average": 4, "evaluate_every": 6, "validation": 1, "save_every": 3,
+    "frames": (4, 6), "sampling": SamplingConfig(tracks=6),
+}  # fmt: skip
 BUDGETS = {
-    "lab": Budget(TrainConfig(tracker=_LAB, frames=8, sampling=SamplingConfig(tracks=48), **_LAB_STEPS, **_FOCUSED)),
-    "tiny": Budget(
-        TrainConfig(
-            tracker=_TINY, frames=(4, 6), sampling=SamplingConfig(tracks=6), save_every=3, **_TINY_STEPS, **_FOCUSED
-        ),
-        tiny_scene,
-        held_out=4,
-        frames=6,
-        points=12,
-    ),
+    "lab": Budget(TrainConfig(tracker=_LAB, **_LAB_STEPS, **_FOCUSED)),
+    "tiny": Budget(TrainConfig(tracker=_TINY, **_TINY_STEPS, **_FOCUSED), tiny_scene, held_out=4, frames=6, points=12),
 }
 
 
@@ -126,26 +114,14 @@ class Data:
 
 def simulated(folder: Path, budget: Budget, workers: int, progress: bool) -> Data:
     """The clips of a budget; missing ones are simulated."""
-    counts = {"train": budget.recipe.clips, "watched": budget.recipe.validation, "held_out": budget.held_out}
-    seeds = {"train": TRAINING, "watched": VALIDATION, "held_out": STUDIES}
-    made = {}
-    for name, count in counts.items():
-        options = (budget.scene, seeds[name].start, workers, progress)
-        made[name] = tuple(simulate_dataset(folder / name, count, *options)) if count else ()
-    return Data(**made)
 
+    def made(name: str, count: int, seeds: range) -> tuple[Path, ...]:
+        options = (budget.scene, seeds.start, workers, progress)
+        return tuple(simulate_dataset(folder / name, count, *options)) if count else ()
 
-def own_clips(train: Path, held_out: Path, budget: Budget) -> Data:
-    """The first clips (npz files with true tracks) of two folders; ValueError where there are fewer than are needed."""
-    found = []
-    for folder, count in ((train, budget.recipe.clips), (held_out, budget.held_out)):
-        paths = sorted(Path(folder).glob("*.npz"))
-        if len(paths) < count:
-            raise ValueError(
-                f"Study: {folder} holds {len(paths)} clips, {count} are needed; add some, or lower the number"
-            )
-        found.append(tuple(paths[:count]))
-    return Data(found[0], (), found[1])
+    recipe = budget.recipe
+    watched = made("watched", recipe.validation, VALIDATION)
+    return Data(made("train", recipe.clips, TRAINING), watched, made("held_out", budget.held_out, STUDIES))
 
 
 def judged_clip(path: Path, budget: Budget) -> Clip:

@@ -10,6 +10,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -32,7 +33,7 @@ from tapip3d_lite.simulate.dataset import leave_interrupts
 from tapip3d_lite.trackers import load_tracker
 from tapip3d_lite.training.run_folder import read_log
 
-STOPPED = "stopped"
+STOPPED, _FULL = "stopped", "the disk is full"
 Tell = Callable[[int], None]  # says how many steps of a job are done
 Stop = Callable[[], bool]
 
@@ -175,46 +176,40 @@ def do_all(jobs: Sequence[Job], processes: int, tell: Callable[[str, int], None]
 
     A job that fails, or whose process dies, leaves the others alone. A full disk stops all: ValueError.
     """
+    ended, running, waiting, context = {}, {}, list(jobs), multiprocessing.get_context("spawn")
     if processes == 1:
-        return {
-            job.name: STOPPED if stop() else _tried(job, lambda n, job=job: tell(job.name, n), stop) for job in jobs
-        }
-    context, waiting, running, ended = multiprocessing.get_context("spawn"), list(jobs), {}, {}
+        for job in jobs:
+            ended[job.name] = STOPPED if stop() else _unless_full(_tried(job, partial(tell, job.name), stop))
+        return ended
     try:
         while waiting or running:
-            halted = stop()
-            while waiting and len(running) < processes and not halted:
-                started = _start(context, waiting.pop(0))
-                running[started[0]] = started
-            ended |= {job.name: STOPPED for job in waiting} if halted else {}
-            waiting = [] if halted else waiting
-            for connection, *_ in running.values() if halted else ():
-                with contextlib.suppress(OSError):
-                    connection.send(STOPPED)
+            if stop():
+                ended |= {job.name: STOPPED for job in waiting}
+                waiting = []
+                for connection in running:
+                    with contextlib.suppress(OSError):
+                        connection.send(STOPPED)
+            while waiting and len(running) < processes:
+                ours, theirs = context.Pipe()
+                process = context.Process(target=_in_process, args=(waiting[0], theirs), daemon=True)
+                running[ours] = process, waiting.pop(0)
+                process.start()
+                theirs.close()
             for connection in wait(list(running), 0.2):
-                process, job = running[connection][1:]
+                process, job = running[connection]
                 outcome = _heard(connection, process)
                 if isinstance(outcome, int):
                     tell(job.name, outcome)
                     continue
                 process.join()
-                ended[job.name] = outcome
                 del running[connection]
-                _refuse_full_disk(outcome)
+                ended[job.name] = _unless_full(outcome)
     finally:
-        for connection, process, _ in running.values():  # after a second Ctrl-C, or where the disk is full
+        for connection, (process, _) in running.items():  # after a second Ctrl-C, or where the disk is full
             process.terminate()
             process.join()
             connection.close()
     return ended
-
-
-def _start(context: Any, job: Job) -> tuple[Any, Any, Job]:
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_in_process, args=(job, theirs), daemon=True)
-    process.start()
-    theirs.close()
-    return ours, process, job
 
 
 def _in_process(job: Job, connection: Any) -> None:
@@ -250,22 +245,16 @@ def _tried(job: Job, tell: Tell, stop: Stop) -> str:
     torch.set_num_threads(1)
     try:
         return do(job, now_and_then, stop)
-    except OSError as error:
-        outcome = (
-            "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"{type(error).__name__}: {error}"
-        )
     except Exception as error:  # whatever a custom part raises
-        outcome = f"{type(error).__name__}: {error}".splitlines()[0]
+        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+        return _FULL if full else f"{type(error).__name__}: {error}".splitlines()[0]
     finally:
         torch.set_num_threads(threads)
-    return _refuse_full_disk(outcome) if multiprocessing.parent_process() is None else outcome
 
 
-def _refuse_full_disk(outcome: str) -> str:
-    if outcome == "the disk is full":
-        raise ValueError(
-            "Study: the disk is full; make room and run it again: what was saved is kept, and it goes on there"
-        )
+def _unless_full(outcome: str) -> str:
+    if outcome == _FULL:
+        raise ValueError(f"Study: {_FULL}; make room and run it again: what was saved is kept, and it goes on there")
     return outcome
 
 

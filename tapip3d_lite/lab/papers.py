@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tapip3d_lite.files import read_json
 from tapip3d_lite.lab.study import Study
 from tapip3d_lite.lab.variant import Variant
 from tapip3d_lite.validate import check_names
@@ -17,7 +17,7 @@ TABLES: dict[str, dict[str, Any]] = {
 }
 """The paper's tables: `rows` by name, each with the arguments of `Variant`; `against`, and other arguments of `Study`."""
 
-_FIELDS = ("folder", "rows", "against", "seeds", "budget", "steps", "minutes", "flops", "store", "data")
+_FIELDS = ("folder", "rows", "against", "seeds", "budget", "steps", "minutes", "flops", "store")
 
 
 def open_study(source: str | Path, accept_code: bool = False) -> tuple[Study, str | None]:
@@ -46,23 +46,20 @@ def open_study(source: str | Path, accept_code: bool = False) -> tuple[Study, st
     kept = {k: v for k, v in values.items() if k in ("seeds", "budget", "steps", "minutes", "flops")}
     if "store" in values:
         kept["store"] = home / values["store"]
-    if "data" in values:
-        kept["data"] = tuple(home / one for one in values["data"])
     folder = home / values.get("folder", Path("runs") / path.stem)
     study = Study(folder, [Variant(name, **row) for name, row in rows.items()], **kept, accept_code=accept_code)
     return study, values.get("against")
 
 
 def _parsed(path: Path) -> dict[str, Any]:
+    if path.suffix == ".json":
+        return read_json(path)
     try:
-        text = path.read_text(encoding="utf-8")
-        if path.suffix == ".json":
-            return json.loads(text)
-        if sys.version_info < (3, 11):
-            raise ValueError(f"TOML needs Python 3.11, this is {sys.version.split()[0]}; write the same as JSON")
         import tomllib
 
-        return tomllib.loads(text)
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except ImportError:
+        raise ValueError(f"{path}: TOML needs Python 3.11; write the same as JSON") from None
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not readable: {error}") from error
 

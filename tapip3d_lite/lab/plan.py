@@ -16,7 +16,7 @@ from typing import Any
 from urllib.parse import quote
 
 from tapip3d_lite.files import digest, read_json, write_text
-from tapip3d_lite.lab.budgets import Budget, Data, own_clips, simulated
+from tapip3d_lite.lab.budgets import Budget, Data, simulated
 from tapip3d_lite.lab.jobs import Job, probe
 from tapip3d_lite.lab.provenance import diff, own_code, source_code
 from tapip3d_lite.lab.variant import Variant
@@ -24,17 +24,8 @@ from tapip3d_lite.training.recipe import TrainConfig
 
 _ENCODER = ("feature_dim", "stride", "center_rgb", "image_size")  # fields that the encoder, or its input, depends on
 _MATCHING = (
-    "preset",
-    "clips",
-    "matching_steps",
-    "matching",
-    "frames",
-    "sampling",
-    "precision",
-    "average",
-    "warmup",
-    "seed",
-)
+    "preset", "clips", "matching_steps", "matching", "frames", "sampling", "precision", "average", "warmup", "seed",
+)  # fmt: skip
 
 
 @dataclass
@@ -47,7 +38,6 @@ class Plan:
         seeds: number of trainings of each row.
         budget: what rows have in common.
         limit: `{"minutes": …}` or `{"flops": …}`, where not the number of steps is equal.
-        data: two folders of clips of one's own, or None.
         code: digests of the sources.
         clips: digests of the clips, once there are some.
         steps: by recipe, where the limit determines them.
@@ -59,7 +49,6 @@ class Plan:
     seeds: int
     budget: Budget
     limit: dict[str, float]
-    data: list[str] | None
     code: dict[str, str] = field(default_factory=source_code)
     clips: dict[str, str] | None = None
     steps: dict[str, int] = field(default_factory=dict)
@@ -67,7 +56,7 @@ class Plan:
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as `study.json` holds them."""
         rows = {name: row.to_dict() for name, row in self.rows.items()}
-        kept = {name: getattr(self, name) for name in ("seeds", "limit", "data", "clips", "steps", "code")}
+        kept = {name: getattr(self, name) for name in ("seeds", "limit", "clips", "steps", "code")}
         return {"rows": rows, "budget": self.budget.to_dict(), **kept}
 
     def check_rows(self) -> None:
@@ -80,8 +69,7 @@ class Plan:
         """Refuse (ValueError) an old plan that differs in what must be equal; take over what it knows."""
         ours, rows = self.to_dict(), [name for name in self.rows if name in old["rows"]]
         one, other = (
-            {**{k: x[k] for k in ("budget", "limit", "data")}, "rows": {n: x["rows"][n] for n in rows}}
-            for x in (old, ours)
+            {**{k: x[k] for k in ("budget", "limit")}, "rows": {n: x["rows"][n] for n in rows}} for x in (old, ours)
         )
         if found := diff(one, other):
             text = ", ".join(f"{name}={a!r} (now {b!r})" for name, (a, b) in found.items())
@@ -106,10 +94,7 @@ class Plan:
 
     def find_clips(self, processes: int, progress: bool) -> Data:
         """The clips, simulated where they are missing; ValueError where an old study had others."""
-        if self.data:
-            data = own_clips(*map(Path, self.data), self.budget)
-        else:
-            data = simulated(self.store / "clips" / self.budget.scene.__name__, self.budget, processes, progress)
+        data = simulated(self.store / "clips" / self.budget.scene.__name__, self.budget, processes, progress)
         found = {name: digest(*(path.read_bytes() for path in paths)) for name, paths in asdict(data).items()}
         if self.clips not in (None, found):
             changed = ", ".join(diff(self.clips, found))

@@ -12,7 +12,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tapip3d_lite.files import digest
+from tapip3d_lite.files import digest, read_json
+from tapip3d_lite.parts import part_name
 
 _ROOT = Path(__file__).parents[1]
 _UNSEEN = (
@@ -34,11 +35,7 @@ def plain(value: Any) -> Any:
         return {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, Path):
         return str(value)
-    if hasattr(value, "__qualname__"):
-        return f"{value.__module__}:{value.__qualname__}"
-    raise ValueError(
-        f"{value!r} has no name by which another process could find it; give a class or function of a module"
-    )
+    return part_name(value, "a part")
 
 
 def own_code(values: Any) -> dict[str, str]:
@@ -73,7 +70,7 @@ def _config(source: Any) -> Any:
     if isinstance(source, str | Path):
         for name in ("config.json", "study.json"):
             if (path := Path(source) / name).exists():
-                return json.loads(path.read_text(encoding="utf-8"))
+                return read_json(path)
         raise ValueError(
             f"diff: {source} holds neither config.json nor study.json; give a training's or study's folder"
         )

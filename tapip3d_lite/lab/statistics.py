@@ -91,20 +91,6 @@ def verdicts(effects: Sequence[Effect], level: float = 0.05) -> list[str]:
     return ["undecided" if not p <= level else "better" if one.mean > 0 else "worse" for one, p in words]
 
 
-def two_way_bootstrap(values: ArrayLike, n: int = 4000, seed: int = 0) -> tuple[float, float]:
-    """The 95 % percentile interval of the mean of (S, C) values when seeds and clips are both drawn again.
-
-    With fewer than about eight seeds it is too narrow where seeds differ; it stands beside `effect` to show that.
-    """
-    values, rng = np.asarray(values, float), np.random.default_rng(seed)
-    values = values[:, ~np.isnan(values).any(0)]
-    if not values.size:
-        return math.nan, math.nan
-    seeds, clips = (rng.multinomial(k, np.full(k, 1 / k), n) / k for k in values.shape)  # shares (n, S), (n, C)
-    low, high = np.quantile(((seeds @ values) * clips).sum(1), [0.025, 0.975])
-    return float(low), float(high)
-
-
 def _mean_squares(values: np.ndarray) -> tuple[float, float, float]:
     """Mean squares (A, B, E) of seeds, clips, and the rest."""
     seeds, clips = values.shape

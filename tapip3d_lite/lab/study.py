@@ -50,7 +50,6 @@ class Study:
         minutes: float | None = None,
         flops: float | None = None,
         store: str | Path | None = None,
-        data: tuple[str | Path, str | Path] | None = None,
         accept_code: bool = False,
     ) -> None:
         """Plan a study, or open one; nothing is computed yet. What a folder's study has, need not be given again.
@@ -64,17 +63,15 @@ class Study:
             minutes: of training steps of every row, on one core; each row gets as many steps as it makes in this time.
             flops: floating-point operations of the training of every row; each row gets as many steps as these allow.
             store: what studies can share; by default `folder / "store"`.
-            data: folders of clips of one's own: to train on, and to be judged by.
             accept_code: go on with results of other code; each result says with which code it was made.
 
         Raises:
             ValueError: no rows, two of one name, rows that cannot be built, a bad number, or a folder of other rows of
                 these names, another budget, clips or code (says what differs).
         """
-        folder, old = Path(folder), None
-        if (folder / "study.json").exists():
-            old = read_json(folder / "study.json")
-        elif rows is None:
+        folder = Path(folder)
+        old = read_json(folder / "study.json") if (folder / "study.json").exists() else None
+        if old is None and rows is None:
             raise ValueError(
                 f"Study: {folder} holds no study; give rows, e.g. [Variant('n2n'), Variant('p2n', context='p2n')]"
             )
@@ -82,11 +79,7 @@ class Study:
         names = [row.name for row in rows]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"Study: two rows are called {', '.join(twice)}; rename one")
-        limits = {
-            name: value
-            for name, value in {"steps": steps, "minutes": minutes, "flops": flops}.items()
-            if value is not None
-        }
+        limits = {k: v for k, v in (("steps", steps), ("minutes", minutes), ("flops", flops)) if v is not None}
         if not rows or len(limits) > 1 or any(value <= 0 for value in limits.values()):
             raise ValueError(
                 f"Study: expected rows, and at most one positive number of steps, minutes or flops; got {limits}"
@@ -96,13 +89,10 @@ class Study:
             raise ValueError(f"Study.seeds: expected a number of trainings of at least 1, got {seeds!r}")
         budget = _chosen(budget, old)
         if steps is not None:
-            budget = replace(budget, recipe=replace(budget.recipe, steps=steps))
-        limit = (
-            {name: value for name, value in limits.items() if name != "steps"} if limits or not old else old["limit"]
-        )
-        data = [str(Path(one).resolve()) for one in data] if data else old["data"] if old else None
+            budget = replace(budget, recipe=replace(budget.recipe, steps=limits.pop("steps")))
+        limit = old["limit"] if old and not limits and steps is None else limits
         store = Path(store) if store else folder / "store"
-        self.plan = Plan(folder, store, dict(zip(names, rows, strict=True)), seeds, budget, limit, data)
+        self.plan = Plan(folder, store, dict(zip(names, rows, strict=True)), seeds, budget, limit)
         self.plan.check_rows()
         self._data: Data | None = None
         if old is not None:
@@ -142,12 +132,10 @@ class Study:
             plan.divide(data, device)
             todo = plan.trainings(data, device)
             failed = work(todo)
-        for job in todo if failed else ():
-            for row, file, facts in job.rows if job.name in failed else ():
-                if not is_scored(file, facts["key"]):
-                    write_text(
-                        file, json.dumps({**facts, "row": row["name"], "failed": failed[job.name]}, indent=1) + "\n"
-                    )
+        for job in (job for job in todo if failed and job.name in failed):
+            for row, file, facts in (one for one in job.rows if not is_scored(one[1], one[2]["key"])):
+                values = {**facts, "row": row["name"], "failed": failed[job.name]}
+                write_text(file, json.dumps(values, indent=1) + "\n")
         return failed is not None
 
     def results(self) -> dict[str, dict[int, dict[str, Any]]]:
@@ -172,15 +160,11 @@ class Study:
 
         Returns the Markdown file. ValueError as for `table`.
         """
-        table, results, trainings = self.table(against), self.results(), self.plan.store / "trainings"
-        first = {
-            name: next((x["training"] for x in seeds.values() if "scores" in x), None)
-            for name, seeds in results.items()
-        }
-        logs = {
-            name: trainings / one for name, one in first.items() if one and (trainings / one / "log.jsonl").exists()
-        }
-        logs = {name: read_log(one) for name, one in logs.items()}
+        table, results, logs = self.table(against), self.results(), {}
+        for name, seeds in results.items():
+            training = next((x["training"] for x in seeds.values() if x.get("training") and "scores" in x), None)
+            if training and (log := self.plan.store / "trainings" / training / "log.jsonl").exists():
+                logs[name] = read_log(log)
         return write_report(Path(folder), table, results, logs, self.plan.to_dict())
 
     def tracks(self, row: str, clip: str, seed: int = 0) -> tuple[Clip, Tracks]:

@@ -10,17 +10,18 @@ from typing import Any
 import numpy as np
 
 from tapip3d_lite.evaluation.evaluate import markdown_table
-from tapip3d_lite.lab.statistics import Effect, effect, paired, two_way_bootstrap, verdicts
+from tapip3d_lite.lab.statistics import Effect, effect, paired, verdicts
 from tapip3d_lite.validate import check_names
 
 JUDGED = ("APD3D_none_dynamic", "AJ3D_none")  # first, second
 Results = Mapping[str, Mapping[int, Mapping[str, Any]]]  # row → seed → what its file holds
+Seeds = Mapping[int, Mapping[str, Any]]
 _TITLES = {"APD3D_none_dynamic": "APD3D, moving points", "AJ3D_none": "AJ3D"}
-_COSTS = {
-    "parameters": "parameters (M)",
-    "multiply_adds": "multiply-adds (M)",
-    "step_ms": "step (ms)",
-    "steps": "steps",
+_COSTS = {  # title, unit, digits
+    "parameters": ("parameters (M)", 1e6, 3),
+    "multiply_adds": ("multiply-adds (M)", 1e6, 3),
+    "step_ms": ("step (ms)", 1, 0),
+    "steps": ("steps", 1, 0),
 }
 
 
@@ -36,79 +37,66 @@ class Table:
     """
 
     rows: list[dict[str, Any]]
-    against: str | None
+    against: str
     metrics: tuple[str, ...]
     notes: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
-        head = ["row", "seeds"]
+        head, last = ["row", "seeds"], ["smallest difference that each comparison would see", ""]
         for metric in self.metrics:
-            head += [_TITLES.get(metric, metric)]
-            head += [f"minus {self.against}", "verdict"] if self.against else []
-        cells = [
-            [row["row"], "–" if row["seeds"] is None else row["seeds"], *self._scores(row), *_cost_cells(row)]
-            for row in self.rows
-        ]
-        if self.against:
-            found = [
-                [row[m]["difference"]["seen"] for row in self.rows if "difference" in row[m]] for m in self.metrics
-            ]
-            seen = [[x for x in one if not math.isnan(x)] for one in found]
-            shown = [cell for one in seen for cell in ("", f"{max(one):.3f}" if one else "–", "")]
-            cells.append(["smallest difference that each comparison would see", "", *shown, *[""] * len(_COSTS)])
-        table = markdown_table([*head, *_COSTS.values()], [[str(cell) for cell in row] for row in cells])
-        return "\n\n".join([table, *self.notes])
+            head += [_TITLES.get(metric, metric), f"minus {self.against}", "verdict"]
+            seen = [row[metric]["difference"]["seen"] for row in self.rows if "difference" in row[metric]]
+            seen = [x for x in seen if not math.isnan(x)]
+            last += ["", f"{max(seen):.3f}" if seen else "–", ""]
+        head += [title for title, *_ in _COSTS.values()]
+        cells = [*map(self._cells, self.rows), [*last, *[""] * len(_COSTS)]]
+        return "\n\n".join([markdown_table(head, cells), *self.notes])
 
     def _repr_markdown_(self) -> str:
         return str(self)
 
-    def _scores(self, row: dict[str, Any]) -> list[str]:
-        shown = []
-        for metric in self.metrics:
-            one = row[metric]
-            shown.append(_interval(one))
-            if self.against:
-                shown += [_interval(one["difference"], "+"), one["verdict"]] if "difference" in one else ["", ""]
-        return shown
+    def _cells(self, row: dict[str, Any]) -> list[str]:
+        shown = [row["row"], "–" if row["seeds"] is None else str(row["seeds"])]
+        for one in (row[metric] for metric in self.metrics):
+            shown += [_interval(one), _interval(one.get("difference"), "+"), one.get("verdict", "")]
+        costs = [(row[name], unit, digits) for name, (_, unit, digits) in _COSTS.items()]
+        return shown + ["–" if x is None else f"{x / unit:.{digits}f}" for x, unit, digits in costs]
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in plain values; NaN as None."""
         return _without_nan(asdict(self))
 
 
-def compare(results: Results, against: str | None, metrics: Sequence[str]) -> Table:
+def compare(results: Results, against: str, metrics: Sequence[str]) -> Table:
     """The table of some results.
 
     Args:
         results: of all rows, in their order.
-        against: the row that the others are compared with; None: none.
+        against: the row that the others are compared with.
         metrics: that judge; one family, over which Holm's correction goes.
 
     Raises:
         ValueError: an unknown row or metric, or no scores at all.
     """
-    check_names("table: against", [] if against is None else [against], results)
+    check_names("table: against", [against], results)
     scored = {name: _scored(seeds) for name, seeds in results.items()}
     known = {name for seeds in scored.values() for x in seeds.values() for one in x["scores"].values() for name in one}
     if not known:
         raise ValueError("table: no row has scores yet; run the study first")
     check_names("table: metric", metrics, known)
-    rows, found = [], []
+    rows, compared, effects, base = [], [], [], scored[against]
     for name, seeds in scored.items():
         failed = next((x["failed"] for x in results[name].values() if "failed" in x), None)
         rows.append({"row": name, "seeds": len(seeds) if _drawn(seeds) else None, "failed": failed, **_costs(seeds)})
+        ours, theirs = _common(seeds, base)
         for metric in metrics:
             rows[-1][metric] = asdict(effect(_matrix(seeds, metric), _drawn(seeds)) if seeds else Effect(math.nan))
-            common = _common(seeds, scored.get(against, {}))
-            if name != against and common[0]:
-                found.append((rows[-1][metric], _drawn(seeds) or _drawn(scored[against])))
-                found[-1] += tuple(
-                    _matrix(x, metric, some) for x, some in zip((seeds, scored[against]), common, strict=True)
-                )
-    effects = [paired(ours, theirs, drawn) for _, drawn, ours, theirs in found]
-    for (one, drawn, ours, theirs), difference, verdict in zip(found, effects, verdicts(effects), strict=True):
+            if name != against and ours:
+                both = _matrix(seeds, metric, ours), _matrix(base, metric, theirs)
+                compared.append(rows[-1][metric])
+                effects.append(paired(*both, _drawn(seeds) or _drawn(base)))
+    for one, difference, verdict in zip(compared, effects, verdicts(effects), strict=True):
         one |= {"difference": asdict(difference), "verdict": verdict}
-        one["bootstrap"] = two_way_bootstrap(ours - theirs) if drawn else None
     return Table(rows, against, tuple(metrics), _notes(rows, results, against))
 
 
@@ -131,63 +119,53 @@ def gaps_by_clip(
     return sorted(gaps, key=lambda pair: -abs(pair[1]))
 
 
-def _scored(seeds: Mapping[int, Mapping[str, Any]]) -> dict[int, Mapping[str, Any]]:
+def _scored(seeds: Seeds) -> Seeds:
     return {seed: x for seed, x in seeds.items() if "scores" in x}
 
 
-def _drawn(seeds: Mapping[int, Mapping[str, Any]]) -> bool:
+def _drawn(seeds: Seeds) -> bool:
     """Whether a row was trained, so that its seeds are drawn from many."""
     return any(x["training"] for x in seeds.values())
 
 
-def _common(one: Mapping[int, Any], other: Mapping[int, Any]) -> tuple[list[int], list[int]]:
+def _common(one: Seeds, other: Seeds) -> tuple[list[int], list[int]]:
     """The seeds of each that are compared: equal ones; a tracker that was not trained stands beside every seed."""
     if not one or not other:
         return [], []
-    every = [sorted(x) if _drawn(x) else None for x in (one, other)]
-    trained = [set(x) for x in every if x is not None]
+    trained = [set(x) for x in (one, other) if _drawn(x)]
     common = sorted(set.intersection(*trained)) if trained else [0]
-    return tuple(common if x is not None else [0] * len(common) for x in every)
+    return tuple(common if _drawn(x) else [0] * len(common) for x in (one, other))
 
 
-def _matrix(seeds: Mapping[int, Mapping[str, Any]], metric: str, some: Sequence[int] | None = None) -> np.ndarray:
+def _matrix(seeds: Seeds, metric: str, some: Sequence[int] | None = None) -> np.ndarray:
     """A metric (S, C) of one row by seed and clip, in the order of their names; NaN where it is undefined."""
     found = [seeds[seed]["scores"] for seed in (seeds if some is None else some)]
-    values = [[scores[clip].get(metric) for clip in sorted(scores)] for scores in found]
-    return np.array([[math.nan if x is None else x for x in one] for one in values], float)
+    return np.array([[scores[clip].get(metric) for clip in sorted(scores)] for scores in found], float)  # None: NaN
 
 
-def _costs(seeds: Mapping[int, Mapping[str, Any]]) -> dict[str, float | None]:
-    found = [x["costs"] for x in seeds.values()]
-    values = {name: [x[name] for x in found if name in x] for name in _COSTS}
+def _costs(seeds: Seeds) -> dict[str, float | None]:
+    values = {name: [x["costs"][name] for x in seeds.values() if name in x["costs"]] for name in _COSTS}
     return {name: float(np.median(x)) if x else None for name, x in values.items()}
 
 
-def _notes(rows: Sequence[dict[str, Any]], results: Results, against: str | None) -> list[str]:
+def _notes(rows: Sequence[dict[str, Any]], results: Results, against: str) -> list[str]:
     notes = [f"**{row['row']}** failed: {row['failed']}" for row in rows if row["failed"]]
     codes = {x.get("code") for seeds in results.values() for x in seeds.values()}
     if len(codes) > 1:
         notes.append(f"The rows were made by {len(codes)} versions of the code.")
-    if against:
-        notes.append(
-            f"Differences to {against}, paired by seed and clip, with 95 % intervals over seeds and clips. A verdict counts "
-            "all comparisons of the table (Holm); the last row is for one comparison alone, at 80 % power. Multiply-adds "
-            "are for each query and frame, the encoder's share included."
-        )
-    return notes
+    return [
+        *notes,
+        f"Differences to {against}, paired by seed and clip, with 95 % intervals over seeds and clips. A verdict counts "
+        "all comparisons of the table (Holm); the last row is for one comparison alone, at 80 % power. Multiply-adds "
+        "are for each query and frame, the encoder's share included.",
+    ]
 
 
-def _interval(one: Mapping[str, float] | Effect, sign: str = "") -> str:
-    if math.isnan(one["mean"]):
-        return "–"
+def _interval(one: Mapping[str, float] | None, sign: str = "") -> str:
+    if one is None or math.isnan(one["mean"]):
+        return "" if one is None else "–"
     bounds = "" if math.isnan(one["low"]) else f" [{one['low']:{sign}.3f}, {one['high']:{sign}.3f}]"
     return f"{one['mean']:{sign}.3f}{bounds}"
-
-
-def _cost_cells(row: Mapping[str, Any]) -> list[str]:
-    million = [f"{row[name] / 1e6:.3f}" if row[name] is not None else "–" for name in ("parameters", "multiply_adds")]
-    step = "–" if row["step_ms"] is None else f"{row['step_ms']:.0f}"
-    return [*million, step, "–" if row["steps"] is None else f"{row['steps']:.0f}"]
 
 
 def _without_nan(value: Any) -> Any:
