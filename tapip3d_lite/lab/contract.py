@@ -65,9 +65,8 @@ class PartReport:
     def __str__(self) -> str:
         head = f"{self.part} ({self.switch or 'unknown switch'}): "
         head += "keeps the contract" if self.ok else f"{len(self.faults)} fault{'s' if len(self.faults) > 1 else ''}"
-        return "\n".join(
-            [head, *(f"- {k}: {v}" for k, v in self.faults.items()), *(f"- note: {x}" for x in self.notes)]
-        )
+        lines = [f"{kind}: {text}" for kind, text in self.faults.items()] + [f"note: {text}" for text in self.notes]
+        return "\n- ".join([head, *lines])
 
     __repr__ = __str__
 

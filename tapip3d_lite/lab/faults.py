@@ -39,11 +39,10 @@ def examine(probe: Probe, switch: str, config: TrackerConfig, faults: dict[str, 
         add(_formal(probe, out))
         if "shape" in faults or "type" in faults:
             return
-        add(_finite(probe, out))
-        add(_repeated(probe, out))
-        add(_apart(probe))
-        add(_values(probe, out))
-        add(_precision(probe, switch))
+        for check in (_finite, _repeated, _apart, _values):
+            add(check(probe, out))
+        if switch != "space":  # spaces compute in float32 always
+            add(_precision(probe))
         add(_device(probe, switch, notes))
     add(_gradients(probe, switch))
     if not faults:
@@ -96,7 +95,7 @@ def _repeated(probe: Probe, out: Tensors) -> Faults:
         yield "memory", "the result depends on calls before, expected nothing kept between calls"
 
 
-def _apart(probe: Probe) -> Faults:
+def _apart(probe: Probe, _: Tensors) -> Faults:
     other = {name: torch.cat([x[:1], _another(x[1:])]) for name, x in probe.inputs.items()}
     for mode in (False, True):  # in training too, where batch normalisation mixes clips
         owner = copy.deepcopy(probe.owner).train(mode)
@@ -114,30 +113,24 @@ def _apart(probe: Probe) -> Faults:
             yield "tracks", "the result of one track changes with the other tracks, expected no influence"
     if probe.unused is not None:
         inputs, text = probe.unused(probe.inputs)
-        kept = _counted(probe, probe.inputs), _counted(probe, inputs)
+        kept = [  # of inactive tracks, the last ones, outputs may be anything
+            {name: x[:, :, :-1] if x.ndim > 2 else x for name, x in _run(probe, given).items()}
+            for given in (probe.inputs, inputs)
+        ]
         if not _same(*kept):
             yield "unused", f"the result depends on values {text}; expected none"
 
 
-def _counted(probe: Probe, inputs: Tensors) -> Tensors:
-    """Outputs without those of inactive tracks, which may be anything."""
-    return {name: x[:, :, :-1] if x.ndim > 2 else x for name, x in _run(probe, inputs).items()}
-
-
 def _first_clip(probe: Probe, inputs: Tensors, owner: nn.Module) -> Tensors:
     """Outputs of clip 0; where outputs are of all clips together (a loss), their gradients for it."""
-    if isinstance(probe.owner, Holder):
-        with torch.enable_grad():
-            given = {k: x.clone().requires_grad_(k in probe.learnt) for k, x in inputs.items()}
-            torch.manual_seed(0)
-            total = sum(probe.call(owner, given).values())
-            found = (
-                torch.autograd.grad(total, [given[k] for k in probe.learnt], allow_unused=True)
-                if total.requires_grad
-                else ()
-            )
-        return {str(i): x[0] for i, x in enumerate(found) if x is not None}
-    return {name: x[0] for name, x in _run(probe, inputs, owner=owner).items()}
+    if not isinstance(probe.owner, Holder):
+        return {name: x[0] for name, x in _run(probe, inputs, owner=owner).items()}
+    with torch.enable_grad():
+        given = {k: x.clone().requires_grad_(k in probe.learnt) for k, x in inputs.items()}
+        torch.manual_seed(0)
+        total, learnt = sum(probe.call(owner, given).values()), [given[k] for k in probe.learnt]
+        found = torch.autograd.grad(total, learnt, allow_unused=True) if total.requires_grad else ()
+    return {str(i): x[0] for i, x in enumerate(found) if x is not None}
 
 
 def _another(x: Tensor) -> Tensor:
@@ -158,17 +151,13 @@ def _values(probe: Probe, out: Tensors) -> Faults:
             yield "values", text
 
 
-def _precision(probe: Probe, switch: str) -> Faults:
-    if switch == "space":  # spaces compute in float32 always
-        return
+def _precision(probe: Probe) -> Faults:
     try:
         with torch.autocast("cpu", torch.bfloat16):
             _run(probe, probe.inputs)
     except Exception as error:
-        yield (
-            "dtype",
-            f"it fails where torch.autocast gives bfloat16: {said(error)}; expected to take what the layers give",
-        )
+        text = f"it fails where torch.autocast gives bfloat16: {said(error)}"
+        yield "dtype", f"{text}; expected to take what the layers give"
 
 
 class MixedDevicesError(RuntimeError):
@@ -198,18 +187,20 @@ def _device(probe: Probe, switch: str, notes: list[str]) -> Faults:
         yield "device", f"in the operation {error} {text}"
         return
     except Exception as error:
-        if "same device" in str(error):
-            yield "device", f"{text} ({said(error)})"
-        elif "numpy" in str(error) or "can't convert" in str(error):
+        reason = said(error)
+        if "same device" in reason:
+            yield "device", f"{text} ({reason})"
+        elif "numpy" in reason or "can't convert" in reason:
             yield (
                 "device",
-                f"values are taken to the CPU ({said(error)}), expected torch operations on the inputs' device",
+                f"values are taken to the CPU ({reason}), expected operations of torch on the inputs' device",
             )
-        elif "unsupported scalarType" not in str(error):  # torch.autocast does not know the device "meta"
-            text = f"it looks at values ({said(error)[:100]} …), so a GPU is waited for, and no CUDA graph can hold it"
-            notes.append(text)
+        elif "unsupported scalarType" not in reason:  # torch.autocast does not know the device "meta"
+            notes.append(
+                f"it looks at values ({reason[:100]} …), so a GPU is waited for, and no CUDA graph can hold it"
+            )
             if getattr(getattr(owner, switch), "sync_free", False):
-                yield "device", f"{text}; expected sync_free = False"
+                yield "device", f"{notes[-1]}; expected sync_free = False"
         return
     if wrong := [name for name, x in out.items() if x.device.type != "meta"]:
         yield "device", f"{wrong[0]} is on the CPU: {text}"
@@ -225,13 +216,11 @@ def _gradients(probe: Probe, switch: str) -> Faults:
             parameter += 0.1 * torch.randn(parameter.shape)
     for where, inputs in {"": probe.inputs, **probe.variants}.items():
         given = {name: x.clone().requires_grad_(name in probe.learnt) for name, x in inputs.items()}
-        out = [x for x in probe.call(owner, given).values() if x.is_floating_point()]
-        total = sum(
-            (x * torch.linspace(0.5, 1.5, max(x.numel(), 1)).view(x.shape)).sum() for x in out if x.requires_grad
-        )
-        if not isinstance(total, Tensor):
+        out = [x.flatten() for x in probe.call(owner, given).values() if x.requires_grad]
+        if not out:
             yield "gradient", "the outputs carry no gradient at all; expected no detach, no_grad, or rounding"
             return
+        total = sum((x * torch.linspace(0.5, 1.5, len(x))).sum() for x in out)
         wanted = [given[name] for name in probe.learnt] + list(named.values())
         found = torch.autograd.grad(total, wanted, allow_unused=True)
         if any(x is not None and not x.isfinite().all() for x in found):
@@ -241,20 +230,13 @@ def _gradients(probe: Probe, switch: str) -> Faults:
         stopped = [x is None or not x.any() for x in found]
         dead = [name for name, stop in zip(named, stopped[len(probe.learnt) :], strict=True) if stop]
         if dead:
-            yield (
-                "gradient",
-                f"no gradient reaches the parameter {', '.join(dead[:3])}; expected one for each, or a buffer",
-            )
-        for name, stop in zip(probe.learnt, stopped, strict=False):
+            text = f"no gradient reaches the parameter {', '.join(dead[:3])}"
+            yield "gradient", f"{text}; expected one for each, or a buffer"
+        for name in (name for name, stop in zip(probe.learnt, stopped, strict=False) if stop):
             moved = inputs | {name: inputs[name] + 0.1 * torch.randn(inputs[name].shape)}
-            if stop and (
-                isinstance(owner, Holder)
-                or not _same(_run(probe, moved, owner=owner), _run(probe, inputs, owner=owner))
-            ):
-                yield (
-                    "gradient",
-                    f"the outputs depend on {name}, but no gradient reaches it; expected no detach or no_grad",
-                )
+            if isinstance(owner, Holder) or not _same(*(_run(probe, x, owner=owner) for x in (moved, inputs))):
+                text = f"the outputs depend on {name}, but no gradient reaches it"
+                yield "gradient", f"{text}; expected no detach or no_grad"
 
 
 def _whole(probe: Probe, switch: str, config: TrackerConfig) -> Faults:
