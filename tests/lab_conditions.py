@@ -1,8 +1,13 @@
-"""Conditions for the studies of test_lab, which worker processes import."""
+"""Conditions and a part for the studies of test_lab, which worker processes import."""
 
 import os
 import signal
 from dataclasses import replace
+
+import torch
+from torch import nn
+
+from tapip3d_lite.model.n2n import Context
 
 
 def darker(clip, seed):
@@ -16,3 +21,19 @@ def die(clip, seed):
 
 def broken(clip, seed):
     raise RuntimeError("no such clip\nwith details")
+
+
+class Mean(Context):
+    """A part of a user's own: the query's feature beside the mean of its surroundings'."""
+
+    def __init__(self, config):
+        super().__init__()
+        self.width = config.token_dim
+        self.layer = nn.Linear(2 * config.feature_dim, config.token_dim)
+
+    def describe(self, index, support):
+        return support.features[..., 0, :]
+
+    def forward(self, index, kept, near):
+        found = near.features.mean(-2)
+        return self.layer(torch.cat([kept[:, None].expand_as(found), found], -1))

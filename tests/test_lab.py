@@ -22,7 +22,7 @@ from tapip3d_lite.training.data import FeatureCache
 from tapip3d_lite.training.examples import Examples
 from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.trainer import Trainer
-from tests.lab_conditions import darker
+from tests.lab_conditions import Mean, darker
 from tests.tiny import ROOT
 
 TINY = lab.BUDGETS["tiny"]
@@ -161,6 +161,20 @@ def test_the_order_of_work_and_the_number_of_processes_change_nothing(study, sto
     other = lab.Study(tmp_path / "other", TWO[::-1], seeds=1, store=store, budget="tiny")
     assert other.run(jobs=2, progress=False)
     assert scores(other)["p2n"][0] == scores(study)["p2n"][0] and scores(other)["n2n"][0] == scores(study)["n2n"][0]
+
+
+def test_parts_of_a_users_own_are_rows(store, tmp_path):
+    rows = [lab.Variant("class", context=Mean), lab.Variant("name", context="tests.lab_conditions:Mean")]
+    rows.append(lab.Variant("fewer", context=Mean, track={"neighbors": 2}))
+    made = lab.Study(tmp_path / "own", rows, seeds=1, budget="tiny", store=store)
+    assert made.run(progress=False)
+    found = scores(made)
+    assert found["class"][0] == found["name"][0] and found["fewer"][0] not in (None, found["class"][0])
+    assert len(weights(store)) == 1  # one recipe
+    again = lab.Study(tmp_path / "own", store=store)
+    clip = next(iter(found["class"][0]))
+    assert again.plan.rows["class"].recipe(TINY.recipe).tracker_config().context is Mean
+    assert np.isfinite(again.tracks("class", clip)[1].xyz).all()
 
 
 # --- stops, kills and failures --------------------------------------------------------------------------------------------
