@@ -62,7 +62,7 @@ class Machine:
     }
 
     def __init__(self) -> None:
-        self.stack, self.marks, self.memo = [], [], {}
+        self.stack, self.marks, self.memo, self.encoded = [], [], {}, {}
 
     def run(self, pickled: bytes) -> Any:
         """The one object of a pickle of protocol 2 or later."""
@@ -86,7 +86,8 @@ class Machine:
             case "builtins" | "__builtin__", "bytes" if not arguments:
                 return b""
             case "_codecs", _:
-                return expected(str, arguments[0]).encode("latin-1")
+                text = expected(str, arguments[0])  # each once: a pickle may encode one text a million times
+                return self.encoded.setdefault(text, self.encoded.get(text) or text.encode("latin-1"))
             case _, "scalar":
                 return _number(*arguments)
             case _, "_frombuffer":
@@ -176,7 +177,8 @@ def _array(data: bytes, kind: Record, shape: tuple, fortran: bool) -> np.ndarray
     if not re.fullmatch(r"[fiu][248]|[biu]1|c8|c16|[SU]\d{1,6}", code) or state[1] not in ("<", ">", "|", "="):
         raise ValueError(f"an array of dtype {code[:20]}")
     values = np.frombuffer(data, np.dtype(state[1] + code))
-    values = values.view(np.uint8) != 0 if code == "b1" else values.copy()  # other bytes are neither true nor false
+    if code == "b1" and values.view(np.uint8).max(initial=0) > 1:
+        raise ValueError("a flag that is neither true nor false")
     return values.reshape(expected(tuple, shape), order="F" if fortran else "C")
 
 
@@ -195,7 +197,9 @@ def with_arrays(value: Any, done: dict[int, Any] | None = None) -> Any:
     if isinstance(value, Record):
         _, shape, kind, fortran, data = value.state["state"]
         if kind.arguments[0] == "O8":
-            new = np.empty(len(expected(list, data)), object)
+            if id(expected(list, data)) in done:
+                raise ValueError("one list in several arrays")
+            done[id(data)], new = None, np.empty(len(data), object)
             new[:] = [with_arrays(item, done) for item in data]
             new = new.reshape(shape, order="F" if fortran else "C")
         else:

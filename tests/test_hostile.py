@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 import tapip3d_lite as t3d
 from tapip3d_lite import archive
 from tapip3d_lite.checkpoint_reader import read_checkpoint
-from tapip3d_lite.files import load_npz
+from tapip3d_lite.files import load_npz, load_objects
 from tapip3d_lite.saved import read_saved
 from tests.tiny import SIZES
 
@@ -209,6 +209,24 @@ def test_hostile_pickles(tmp_path, alone, name):
     with_pickle(tmp_path / "x.pth", PICKLES[name].replace(text("%s")[:5], b"X\x02\0\0\0"))
     with within(10), pytest.raises(ValueError, match=r"x\.pth"):
         t3d.load_official(tmp_path / "x.pth")
+
+
+def test_one_text_or_list_is_not_multiplied(tmp_path, alone):
+    encode = b"c_codecs\nencode\nh\0h\1\x86R"
+    pickled = b"\x80\x02(" + text("A" * 10**6) + b"q\0" + text("latin1") + b"q\1" + 1000 * encode + b"t."
+    with_pickle(tmp_path / "x.pth", pickled)
+    with within(20):
+        assert len(read_saved(tmp_path / "x.pth")) == 1002
+    kind = b"cnumpy\ndtype\n" + text("O8") + b"\x85R(K\3" + text("|") + b"NNNtb"
+    array = b"cnumpy.core.multiarray\n_reconstruct\n)R(K\1K\2\x85"
+    first, second = array + kind + b"q\2\x89](K\1K\1eq\3tb", array + b"h\2\x89h\3tb"
+    pickled = b"\x80\x02(" + first + second + b"t."
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "|O", "fortran_order": False, "shape": ()})
+    with pytest.raises(ValueError, match="one list in several arrays"):
+        load_objects("x.npy", io.BytesIO(head.getvalue() + pickled))
+    found = load_objects("x.npy", io.BytesIO(head.getvalue() + pickled.replace(second, b"")))
+    assert found[0].tolist() == [1, 1]
 
 
 def test_numpy_numbers_are_values(tmp_path, alone):

@@ -16,16 +16,8 @@ from tapip3d_lite.files import digest, read_json
 from tapip3d_lite.parts import part_name
 
 _ROOT = Path(__file__).parents[1]
-_UNSEEN = (
-    "figures",
-    "lab",
-    "__main__",
-    "official",
-    "checkpoint_reader",
-    "recorder",
-    "check",
-    "export",
-)  # change no score
+# What changes no score.
+_UNSEEN = ("figures", "lab", "__main__", "official", "checkpoint_reader", "recorder", "check", "export")
 _SEEN = ("lab/conditions.py", "lab/jobs.py")
 
 

@@ -29,13 +29,8 @@ def write_report(
 ) -> Path:
     """Write `report.md`, `report.json` and figures into a folder; returns the first.
 
-    Args:
-        folder: made if missing.
-        table: of the results.
-        results: of all rows.
-        logs: of a training of each row, as far as there are any.
-        plan: what the study was made with.
-        worst: how many clips of each pair to list.
+    `logs` are those of a training of each row, as far as there are any, `plan` what the study was made with, `worst` how
+    many clips of each pair to list.
     """
     metric = table.metrics[0]
     rows = [row for row in table.rows if not math.isnan(row[metric]["mean"])]
