@@ -16,9 +16,9 @@ from tapip3d_lite.clip import Clip
 from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.training.data import training_clips, training_config, validation_clips
-from tapip3d_lite.training.recipe import TrainConfig
+from tapip3d_lite.training.recipe import TrainConfig, initial_weights
 from tapip3d_lite.training.run_folder import RunFolder, check_folder
-from tapip3d_lite.training.trainer import Trainer, initial_weights
+from tapip3d_lite.training.trainer import Trainer
 from tapip3d_lite.validate import check_depths
 
 _SCORES = ("AJ3D_none", "APD3D_none", "OA", "AJ3D_none_dynamic", "APD3D_none_dynamic", "APD3D_none_static")

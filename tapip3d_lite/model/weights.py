@@ -81,12 +81,9 @@ def read_weights(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if metadata.get("format") != _FORMAT:
         raise ValueError(f"{path}: safetensors without a {_FORMAT} config; it belongs to another program")
     try:
-        config = json.loads(metadata["config"])
-    except (ValueError, KeyError, RecursionError) as error:
+        return state, dict(json.loads(metadata["config"]))
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path}: no readable config ({error}); the file is damaged") from error
-    if not isinstance(config, dict):
-        raise ValueError(f"{path}: expected a config of named fields, got {type(config).__name__}; the file is damaged")
-    return state, config
 
 
 def outline(config: TrackerConfig) -> Tracker:

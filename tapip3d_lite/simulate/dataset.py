@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from tapip3d_lite.files import locked, write_text
+from tapip3d_lite.files import locked, read_json, write_text
 from tapip3d_lite.simulate.settings import SimulationConfig
 from tapip3d_lite.simulate.simulator import simulate_clip
 
@@ -90,7 +90,7 @@ def _claim(folder: Path, config: SimulationConfig | Recipe) -> None:
     """Write the folder's description, or check that it is the same."""
     path, description = folder / DESCRIPTION, _describe(config)
     if path.exists():
-        stored = _read(path)
+        stored = read_json(path, lambda x: dict(x.get("simulation", x)))
         wanted = json.loads(json.dumps(description.get("simulation", description)))  # with lists for tuples
         names = [name for name in stored | wanted if stored.get(name) != wanted.get(name)]
         if names:
@@ -111,15 +111,6 @@ def _describe(config: SimulationConfig | Recipe) -> dict:
         return {"simulation": asdict(config)}
     examples = {str(seed): asdict(config(seed)) for seed in range(4)}
     return {"recipe": f"{config.__module__}.{config.__qualname__}", "examples": examples}
-
-
-def _read(path: Path) -> dict:
-    """The stored description as one flat dictionary."""
-    try:
-        stored = json.loads(path.read_text())
-        return dict(stored.get("simulation", stored))
-    except (OSError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not a readable dataset description ({error}); choose another folder") from error
 
 
 def _write(job: tuple[Path, int, SimulationConfig | Recipe]) -> None:

@@ -21,9 +21,11 @@ from torch import Tensor, nn
 from tapip3d_lite.clip import Clip, clip_arrays
 from tapip3d_lite.geometry import pixel_grid, project
 from tapip3d_lite.model.blocks import constant
+from tapip3d_lite.model.encoder import Encoder
+from tapip3d_lite.model.weights import read_weights
 from tapip3d_lite.training.augment import AugmentConfig, augment
 from tapip3d_lite.training.data import pick_frames
-from tapip3d_lite.validate import check_range, check_types
+from tapip3d_lite.validate import check_range, check_state, check_types
 
 _ENOUGH = 16  # points that two frames should share
 _NEAR = 2.5  # radius in cells, around the true place, of the cells whose mean gives a point's place
@@ -179,3 +181,11 @@ def _similarity(maps: Tensor, cells: Tensor) -> Tensor:
     source = normed[:1].movedim(-1, 1)
     own = F.grid_sample(source, grid[None, None], align_corners=True, padding_mode="border")[0, :, 0].T  # (N, C)
     return own @ normed[1].flatten(0, 1).T / maps.shape[1] ** 0.5
+
+
+def take_encoder(encoder: Encoder, folder: str | Path) -> None:
+    """Load the encoder of a finished training's folder; ValueError where it is of other sizes."""
+    stored, own = read_weights(Path(folder) / "weights.safetensors")[0], encoder.state_dict()
+    stored = {name: stored[f"encoder.{name}"] for name in own if f"encoder.{name}" in stored}
+    check_state(stored, own)
+    encoder.load_state_dict(stored)

@@ -9,15 +9,18 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from tapip3d_lite.files import read_json
+from torch import Tensor
+
+from tapip3d_lite.files import read_json, shipped_weights
 from tapip3d_lite.model.config import SWITCHES, TrackerConfig
+from tapip3d_lite.model.weights import outline, read_weights
 from tapip3d_lite.parts import allowed_parts, find_part, part_name
 from tapip3d_lite.training.augment import AugmentConfig
 from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.loss import FORMS, LossConfig
 from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.pretrain import MatchingConfig
-from tapip3d_lite.validate import check_range, check_types
+from tapip3d_lite.validate import check_range, check_state, check_types
 
 
 @dataclass(frozen=True)
@@ -209,3 +212,13 @@ class TrainConfig:
     def read(cls, path: str | Path, parts: Sequence[Any] = ()) -> TrainConfig:
         """The recipe in a training's `config.json`, with `parts` as for `from_dict`; a damaged file is a ValueError."""
         return read_json(path, lambda values: cls.from_dict(values, parts))
+
+
+def initial_weights(config: TrainConfig) -> dict[str, Tensor]:
+    """The weights that a recipe's `init` names; a ValueError if they are not readable or of other sizes."""
+    state = read_weights(shipped_weights().get(config.init, config.init))[0]
+    try:
+        check_state(state, outline(config.tracker_config()).state_dict())
+    except ValueError as error:
+        raise ValueError(f"TrainConfig.init: {config.init!r} belongs to a tracker of other sizes: {error}") from None
+    return state

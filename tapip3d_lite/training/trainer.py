@@ -17,20 +17,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.files import shipped_weights
-from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.registry import fast_step
 from tapip3d_lite.model.tracker import Tracker
-from tapip3d_lite.model.weights import outline, read_weights, save_weights
+from tapip3d_lite.model.weights import save_weights
 from tapip3d_lite.model.windows import Step
 from tapip3d_lite.parts import make_part
+from tapip3d_lite.speed.compiled import compile_parts
 from tapip3d_lite.training.backward import add_gradients, losses
 from tapip3d_lite.training.data import Batch, FeatureCache
 from tapip3d_lite.training.examples import Examples, check_clips
 from tapip3d_lite.training.loss import accuracy, step_accuracy
 from tapip3d_lite.training.parallel import Group
-from tapip3d_lite.training.pretrain import FramePair, matching_loss
-from tapip3d_lite.training.recipe import TrainConfig
+from tapip3d_lite.training.pretrain import FramePair, matching_loss, take_encoder
+from tapip3d_lite.training.recipe import TrainConfig, initial_weights
 from tapip3d_lite.training.run_folder import Bar, RunFolder
 from tapip3d_lite.training.schedule import Schedule, adamw
 from tapip3d_lite.validate import check_state
@@ -98,10 +97,7 @@ class Trainer:
         self.folder = RunFolder(folder, config, resume)
         source = self.folder.path if encoder is None else Path(encoder)
         if encoder is not None:
-            stored, own = read_weights(source / "weights.safetensors")[0], self.tracker.encoder.state_dict()
-            stored = {name: stored[f"encoder.{name}"] for name in own if f"encoder.{name}" in stored}
-            check_state(stored, own)
-            self.tracker.encoder.load_state_dict(stored)
+            take_encoder(self.tracker.encoder, source)
         self.group, self.step, self.seconds = Group(device), 0, 0.0
         self._on_gpu, cache = torch.device(device).type == "cuda", None
         if not config.train_encoder and not self._on_gpu:
@@ -121,7 +117,7 @@ class Trainer:
         if config.average and saved is not None:
             self.average.load_state_dict(saved.get("average", saved["model"]))  # older checkpoints have none
         if compiled:
-            _compile(self.tracker)
+            compile_parts(self.tracker)
         self._enter_stage(saved)
 
     def run(self, stop: Callable[[], bool] = lambda: False, progress: bool = True) -> bool:
@@ -253,25 +249,3 @@ class Trainer:
             scores = self.validate(self.average)
         self.tracker.train()
         return scores
-
-
-def initial_weights(config: TrainConfig) -> dict[str, Tensor]:
-    """The weights that a recipe's `init` names; a ValueError if they are not readable or of other sizes."""
-    state = read_weights(shipped_weights().get(config.init, config.init))[0]
-    try:
-        check_state(state, outline(config.tracker_config()).state_dict())
-    except ValueError as error:
-        raise ValueError(f"TrainConfig.init: {config.init!r} belongs to a tracker of other sizes: {error}") from None
-    return state
-
-
-def _compile(tracker: Tracker) -> None:
-    from torch._dynamo import config as dynamo
-    from torch._functorch import config as functorch
-
-    dynamo.recompile_limit = 64  # levels differ in size
-    functorch.donated_buffer = False  # the queries' neighbourhoods are backpropagated once for each window
-    parts = [tracker.encoder, tracker.neighborhood, tracker.context]
-    parts += [part for part in tracker.updater.modules() if isinstance(part, Block)]  # alike, so compiled once for all
-    for part in parts:
-        part.compile(dynamic=False)
