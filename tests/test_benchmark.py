@@ -111,7 +111,7 @@ def test_a_file_without_recordings_is_refused(tmp_path):
 
 def test_seeds_are_kept_apart(monkeypatch, tmp_path):
     ranges = sorted((getattr(seeds, name) for name in dir(seeds) if name.isupper()), key=lambda r: r.start)
-    assert len(ranges) == 4
+    assert len(ranges) == 5
     assert all(a.stop <= b.start for a, b in pairwise(ranges))
     assert {sample.seed for sample in SAMPLES.values()} <= set(seeds.SAMPLES)
     data = pytest.importorskip("tapip3d_lite.training.data")

@@ -33,17 +33,19 @@ def save_weights(tracker: Tracker, path: str | Path, half: bool = False) -> None
     With `half` floats are stored in 16 bits, which halves the file; they are read back as 32-bit ones.
 
     Raises:
-        ValueError: the tracker has a custom part that is no class, which no file can name, or parameters that are not finite.
+        ValueError: a custom part that is no class, which no file can name, or parameters that are not finite.
     """
     config = json.dumps(tracker.config.to_dict())
     state = {name: (x.half() if half else x).contiguous() for name, x in tracker.state_dict().items()}
     check_state(state, state)
     data = safetensors.torch.save(state, metadata={"format": _FORMAT, "config": config})
     end = 8 + int.from_bytes(data[:8], "little")
-    header = json.dumps(json.loads(data[8:end]), sort_keys=True)  # else in random order: same weights, same bytes
-    header += " " * (-len(header) % 8)
+    header = json.dumps(
+        json.loads(data[8:end]), sort_keys=True
+    ).encode()  # else in random order: same weights, same bytes
+    header = header.ljust(-(-len(header) // 8) * 8)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(len(header).to_bytes(8, "little") + header.encode() + data[end:])
+        temporary.write_bytes(len(header).to_bytes(8, "little") + header + data[end:])
 
 
 def load_weights(path: str | Path, device: str = "cpu", fast: bool = True, parts: Sequence[Any] = ()) -> Tracker:
@@ -52,8 +54,7 @@ def load_weights(path: str | Path, device: str = "cpu", fast: bool = True, parts
     Custom parts that the file names must be among `parts`: classes, matched by name, or names of modules to import.
 
     Raises:
-        ValueError: missing, truncated or foreign file, a part that is not allowed, or parameters that do not fit the config
-            or are not finite.
+        ValueError: missing, truncated or foreign file, a part that is not allowed, parameters that do not fit or are NaN.
     """
     state, config = read_weights(path)
     try:

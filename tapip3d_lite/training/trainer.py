@@ -73,8 +73,7 @@ class Trainer:
             resume: continue from the folder's checkpoint, if there is one.
             workers: processes that make examples ahead of time; for a GPU, which would otherwise wait for them.
             compiled: compile the tracker's parts, which takes minutes and then makes each step faster (GPU).
-            encoder: folder of a training whose encoder is taken over; the features of a frozen one are stored there, for
-                all trainings that share it.
+            encoder: folder of a training whose encoder is taken over; features of a frozen one are stored there, for all.
 
         Raises:
             ValueError: no clips, or unusable ones; the folder holds a training already (without `resume`) or one of
@@ -95,7 +94,7 @@ class Trainer:
         if config.init is not None:
             self.tracker.load_state_dict(initial_weights(config))
         self.folder = RunFolder(folder, config, resume)
-        source = self.folder.path if encoder is None else Path(encoder)
+        source = Path(encoder or self.folder.path)
         if encoder is not None:
             take_encoder(self.tracker.encoder, source)
         self.group, self.step, self.seconds = Group(device), 0, 0.0
