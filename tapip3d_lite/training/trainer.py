@@ -146,14 +146,10 @@ class Trainer:
             halted = self.group.sum(stop()) > 0
             due = halted or self.schedule.finished or self.step % self.config.save_every == 0
             if due and self.group.is_main:
-                state = {"model": self.tracker.state_dict(), "optimizer": self.optimizer.state_dict()}
-                state |= {
-                    "average": self.average.state_dict(),
-                    "step": self.step,
-                    "position": self.schedule.position,
-                    "seconds": self.seconds,
-                }
-                self.folder.save(state)
+                parts = {"model": self.tracker, "optimizer": self.optimizer, "average": self.average}
+                state = {name: part.state_dict() for name, part in parts.items()}
+                counts = {"step": self.step, "position": self.schedule.position, "seconds": self.seconds}
+                self.folder.save(state | counts)
         if self.schedule.finished and self.group.is_main:
             save_weights(self.average, self.folder.path / "weights.safetensors", half=True)
 
