@@ -173,7 +173,8 @@ def page(results: dict, count: int) -> str:
         for s in SPEEDS
     ]  # fmt: skip
     head = ["pixels a frame", *(f"{name}, after {t} frames" for name in names for t in frames)]
-    parts = ["Share of a sliding picture's motion that points follow (median of 36 points, mean of three pictures):"]
+    parts = ["## Beyond clean clips"]
+    parts += ["Share of a sliding picture's motion that points follow (median of 36 points, mean of three pictures):"]
     parts += [markdown_table(head, rows)]
     parts += [f"The first {count} clips of `moving-camera`, changed; paired differences to the same clips as they are:"]
     rows = []
