@@ -2,7 +2,8 @@
 
 A picture that slides at a constant speed; wrong poses, poor depth, soft and grey images and frozen depth on clips of
 `moving-camera`, each against the same clips as they are, paired; the share of hidden frames called visible; what other
-image sizes, fewer updates and bfloat16 cost and save. Results go to a JSON file, which an interrupted run continues, a Markdown page (for `card --also`) and a figure.
+image sizes, fewer updates and bfloat16 cost and save. Results go to a JSON file, which an interrupted run continues, a
+Markdown page (for `card --also`) and a figure.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from tapip3d_lite.simulate.degrade import SensorConfig, degrade, wrong_poses
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)  # pixels a frame, of 128
 RUNS: dict[str, dict] = {
-    "as it is": {},
+    "as it is": {},  # once more, right beside the others, since seconds are compared
     "two updates": {"iterations": 2},
     "four updates": {"iterations": 4},
     "bfloat16": {"autocast": True},
@@ -173,7 +174,8 @@ def page(results: dict, count: int) -> str:
         for s in SPEEDS
     ]  # fmt: skip
     head = ["pixels a frame", *(f"{name}, after {t} frames" for name in names for t in frames)]
-    parts = ["Share of a sliding picture's motion that points follow (median of 36 points, mean of three pictures):"]
+    parts = ["## Beyond clean clips"]
+    parts += ["Share of a sliding picture's motion that points follow (median of 36 points, mean of three pictures):"]
     parts += [markdown_table(head, rows)]
     parts += [f"The first {count} clips of `moving-camera`, changed; paired differences to the same clips as they are:"]
     rows = []

@@ -67,6 +67,10 @@ def test_every_number_comes_from_the_files(folder, results):
     assert "\n\nSlides by a mile.\n\n## Limits\n" in text
     with pytest.raises(ValueError, match="no file"):
         model_card(folder, folder / "bench.json", "x", also=folder / "absent.md")
+    assert "--split" not in text
+    save_results(folder / "bench.json", {x: rows | {"slow": rows[SPLITS[0]]} for x, rows in results.items()})
+    text = model_card(folder, folder / "bench.json", "x")
+    assert f"--tracker static klt lite --split {' '.join(SPLITS)} slow --space" in text and "| slow (4) | klt |" in text
     changed = results | {"klt": results["static"]}
     save_results(folder / "bench.json", changed)
     assert model_card(folder, folder / "bench.json", "two cores of a toaster") != text

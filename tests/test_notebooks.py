@@ -138,6 +138,7 @@ def test_a_kernel_finds_the_lessons_wherever_lab_is_started(tmp_path, monkeypatc
             connection_file=str(tmp_path / "runtime" / f"kernel-{session['kernel']['id']}.json")
         )
         client.load_connection_file()
+        client.hb_channel.time_to_dead = 60.0  # a busy machine misses beats, which would count as death
         client.start_channels()
         try:
             client.wait_for_ready(60)

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import copy
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -37,6 +38,11 @@ class Mistake:
     name: str
     answer: Answer
     hint: str
+
+
+def slips(answer: Answer, hints: Mapping[str, str]) -> tuple[Mistake, ...]:
+    """The mistakes that an answer makes itself when asked to, by the name of its `slip`, each with its hint."""
+    return tuple(Mistake(slip, partial(answer, slip=slip), hint) for slip, hint in hints.items())
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lessons.checker import Exercise, Mistake
+from lessons.checker import Exercise, slips
 from lessons.n05_windows import BACKWARD, HAND_OVER, WINDOWS
 from tapip3d_lite.model.blocks import fourier
 
@@ -89,7 +88,7 @@ TOKEN = Exercise(
     "05.token",
     reference=token,
     cases=_token_case,
-    mistakes=tuple(Mistake(slip, partial(token, slip=slip), hint) for slip, hint in _TOKEN_HINTS.items()),
+    mistakes=slips(token, _TOKEN_HINTS),
     tolerance=2e-3,  # in single precision the fastest waves are off by 1e-3
     gradients=(2,),
 )
@@ -165,7 +164,7 @@ GROUP = Exercise(
     "05.group",
     reference=update_group,
     cases=_group_case,
-    mistakes=tuple(Mistake(slip, partial(update_group, slip=slip), hint) for slip, hint in _GROUP_HINTS.items()),
+    mistakes=slips(update_group, _GROUP_HINTS),
     tolerance=1e-3,
     gradients=(0,),
 )

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
-from lessons.checker import Exercise, Mistake
+from lessons.checker import Exercise, slips
 
 Array = np.ndarray
 
@@ -66,7 +64,7 @@ SCORES = Exercise(
     "07.scores",
     reference=scores,
     cases=_counted,
-    mistakes=tuple(Mistake(slip, partial(scores, slip=slip), hint) for slip, hint in _SCORES_HINTS.items()),
+    mistakes=slips(scores, _SCORES_HINTS),
 )
 
 
@@ -118,7 +116,7 @@ RASTER = Exercise(
     "07.raster",
     reference=to_raster,
     cases=_filmed,
-    mistakes=tuple(Mistake(slip, partial(to_raster, slip=slip), hint) for slip, hint in _RASTER_HINTS.items()),
+    mistakes=slips(to_raster, _RASTER_HINTS),
     tolerance=1e-6,
 )
 
@@ -172,7 +170,7 @@ INTERVAL = Exercise(
     "07.interval",
     reference=interval,
     cases=_resampled,
-    mistakes=tuple(Mistake(slip, partial(interval, slip=slip), hint) for slip, hint in _INTERVAL_HINTS.items()),
+    mistakes=slips(interval, _INTERVAL_HINTS),
     tolerance=1e-6,
 )
 
@@ -235,7 +233,7 @@ WORST = Exercise(
     "07.worst",
     reference=worst,
     cases=_tracked,
-    mistakes=tuple(Mistake(slip, partial(worst, slip=slip), hint) for slip, hint in _WORST_HINTS.items()),
+    mistakes=slips(worst, _WORST_HINTS),
 )
 
 EXERCISES = (SCORES, RASTER, INTERVAL, WORST)

@@ -111,8 +111,6 @@ def pipeline(lesson: str) -> Shown:
     )
     alt = (
         "The method from left to right: frames with depth and cameras; encoder and lifting side by side; world space; "
-    )
-    alt += (
         "feature cloud; neighbours; attention between neighbourhoods; updater, which loops back; tracks; loss; scores. "
     )
     return show(figure, f"{alt}Lit: {words}.", f"Where we are: {words}. The small numbers are the lessons.")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tapip3d_lite.evaluation.benchmark import ALL, METRICS, difference_table, load_results, summary_table
+from tapip3d_lite.evaluation.benchmark import ALL, METRICS, SPLITS, difference_table, load_results, summary_table
 from tapip3d_lite.model.weights import load_weights
 from tapip3d_lite.training.augment import augmentations
 from tapip3d_lite.training.recipe import TrainConfig
@@ -52,7 +52,11 @@ def model_card(
         )
     compared = [label for label in scores if any(split in scores[label] for split in ALL)]
     trackers = " ".join(dict.fromkeys(label.rpartition(" · ")[0] or label for label in compared))  # not once a space
-    scoring = f"python -m tapip3d_lite benchmark --tracker {trackers} --space world camera --out {Path(results).name}"
+    splits = [split for split in ALL if any(split in scores[label] for label in compared)]
+    chosen = f" --split {' '.join(splits)}" if set(splits) - set(SPLITS) else ""
+    scoring = (
+        f"python -m tapip3d_lite benchmark --tracker {trackers}{chosen} --space world camera --out {Path(results).name}"
+    )
     parts = [
         f"# Model card: `{name}`",
         _facts(config, log, path, hardware, parts),
@@ -90,7 +94,7 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str, p
         "model": f"preset `{config.preset}`, images {model.image_size[0]}x{model.image_size[1]}, window {model.window}, "
         f"K = {model.neighbors}, {model.levels} levels from stride {model.stride}",
         "data": f"{config.clips} simulated clips; examples of {_range(config.frames)} frames and {config.sampling.tracks} "
-        f"tracks; images {_changes(config)}",
+        f"tracks; images {_changes(config)}; a poor sensor in {config.sensor:.0%}, wrong poses in {config.motion.wrong:.0%}",
         "steps": _steps(config, log),
         "recipe": f"AdamW {config.lr:g}, weight decay {config.weight_decay:g}, one cycle, M = {_range(config.iterations)}, "
         f"{config.precision}, encoder {'trained along' if config.train_encoder else 'frozen after matching'}, seed {config.seed}",
