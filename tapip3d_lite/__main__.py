@@ -26,6 +26,7 @@ from tapip3d_lite.export import WRITERS
 from tapip3d_lite.files import check_suffix, write_text
 from tapip3d_lite.formats import FORMATS
 from tapip3d_lite.lab.card import model_card
+from tapip3d_lite.lab.table import JUDGED
 from tapip3d_lite.simulate import simulate_dataset
 from tapip3d_lite.trackers import tracker_runs
 from tapip3d_lite.training.recipe import TrainConfig
@@ -236,12 +237,10 @@ def lab(
     jobs: Annotated[int, arg(help="trainings at once (run)")] = 1,
     device: Annotated[str, arg(help="cpu or cuda (run)")] = "cpu",
     against: Annotated[str | None, arg(help="the row that others are compared with")] = None,
-    metric: Annotated[tuple[str, ...], arg(help="that judge, the first one first")] = (
-        "APD3D_none_dynamic",
-        "AJ3D_none",
-    ),
+    metric: Annotated[tuple[str, ...], arg(help="that judge, the first one first")] = JUDGED,
     out: Annotated[Path, arg(help="folder (report)")] = Path("report"),
     accept_code: Annotated[bool, arg(help="go on with results of other code")] = False,
+    allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
     """Run a study of rows under equal conditions; its table, its report, its rows, or the paper's tables by name."""
     from tapip3d_lite.lab.papers import TABLES, listed, open_study
@@ -249,7 +248,7 @@ def lab(
     if study is None:
         print("\n".join(f"{name}: {', '.join(values['rows'])}" for name, values in TABLES.items()))
         return
-    opened, base = open_study(study, accept_code)
+    opened, base = open_study(study, accept_code, allow)
     if action == "run" and not opened.run(jobs, device):
         print("stopped and saved; the same command goes on")
         sys.exit(130)

@@ -73,7 +73,7 @@ def scores(study):
         ({"track": {"iteration": 3}}, "did you mean iterations"),
         ({"degrade": {"pose": 3}}, "did you mean poses"),
         ({"degrade": {"frozen": "time"}}, "frozen must be a part"),
-        ({"degrade": lambda clip, seed: clip}, "top level of a module"),
+        ({"degrade": lambda clip, seed: clip}, "module 'tests.test_lab' has no '<lambda>'"),
     ],
 )
 def test_a_row_says_what_it_does_not_know(arguments, message):
@@ -171,10 +171,37 @@ def test_parts_of_a_users_own_are_rows(store, tmp_path):
     found = scores(made)
     assert found["class"][0] == found["name"][0] and found["fewer"][0] not in (None, found["class"][0])
     assert len(weights(store)) == 1  # one recipe
-    again = lab.Study(tmp_path / "own", store=store)
+    again = lab.Study(tmp_path / "own", store=store, parts=[Mean])
     clip = next(iter(found["class"][0]))
     assert again.plan.rows["class"].recipe(TINY.recipe).tracker_config().context is Mean
     assert np.isfinite(again.tracks("class", clip)[1].xyz).all()
+
+
+def test_a_folder_alone_imports_no_code(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "unseen.py").write_text(
+        "def darker(clip, seed):\n    return clip\n\n\ndef scene(seed):\n    return None\n"
+    )
+    row = lab.Variant("dark", tracker="klt", degrade=darker)
+    lab.Study(tmp_path / "study", [row], budget="tiny").plan.save()
+    file, text = tmp_path / "study/study.json", (tmp_path / "study/study.json").read_text()
+    for old, new in (
+        ("tests.lab_conditions:darker", "unseen:darker"),
+        ("tapip3d_lite.lab.budgets:tiny_scene", "unseen:scene"),
+    ):
+        assert old in text
+        file.write_text(text.replace(old, new))
+        with pytest.raises(ValueError, match=r"a file alone imports no code; .* --allow unseen"):
+            lab.Study(tmp_path / "study", parts=["tests.lab_conditions"])
+        assert "unseen" not in sys.modules
+    file.write_text(text.replace("tests.lab_conditions:darker", "unseen:darker"))
+    assert lab.Study(tmp_path / "study", parts=["unseen"]).plan.rows["dark"].degrade == "unseen:darker"
+    file.write_text(text)
+    assert lab.Study(tmp_path / "study", [row]).plan.rows["dark"].degrade == "tests.lab_conditions:darker"
+    (tmp_path / "own.json").write_text(json.dumps({"rows": {"dark": row.to_dict()}, "budget": "tiny"}))
+    with pytest.raises(ValueError, match="--allow tests"):
+        open_study(tmp_path / "own.json")
+    assert open_study(tmp_path / "own.json", parts=["tests.lab_conditions"])[0].plan.rows["dark"].degrade
 
 
 # --- stops, kills and failures --------------------------------------------------------------------------------------------
@@ -261,7 +288,7 @@ def test_other_rows_budgets_and_code_are_refused_by_name(study):
         lab.Study(folder, [lab.Variant("p2n")])
     with pytest.raises(ValueError, match=r"budget\.recipe\.steps=12 \(now 13\)"):
         lab.Study(folder, TWO, steps=13)
-    with pytest.raises(ValueError, match=r"limit\.minutes=None \(now 2\)"):
+    with pytest.raises(ValueError, match=r"budget\.recipe\.minutes=None \(now 2\)"):
         lab.Study(folder, TWO, minutes=2)
     code = plan.source_code() | {"model/n2n.py": "changed"}
     assert {"model/n2n.py", "lab/jobs.py", "torch"} <= code.keys() and "figures/flat.py" not in code
@@ -284,7 +311,7 @@ def test_other_clips_are_refused(study, store, tmp_path):
     shutil.copytree(study.plan.folder, tmp_path / "copy", ignore=shutil.ignore_patterns("store"))
     clips = sorted((store / "clips").glob("*/held_out/*.npz"))
     shutil.copy(clips[0], clips[1])
-    with pytest.raises(ValueError, match=r"clips differ .*held_out"):
+    with pytest.raises(ValueError, match=r"clips \(held_out\) differ"):
         lab.Study(tmp_path / "copy", store=store).run(progress=False)
 
 
@@ -296,8 +323,9 @@ def test_other_clips_are_refused(study, store, tmp_path):
         ({"rows": None}, "holds no study"),
         ({"seeds": 0}, "Study.seeds"),
         ({"budget": "labs"}, "did you mean lab"),
-        ({"steps": 5, "minutes": 2}, "at most one positive number"),
-        ({"steps": -1}, "at most one positive number"),
+        ({"steps": 5, "minutes": 2}, "at most one of steps and minutes"),
+        ({"steps": -1}, "TrainConfig.steps"),
+        ({"minutes": 0}, "TrainConfig.minutes"),
     ],
 )
 def test_bad_plans_are_refused(tmp_path, arguments, message):
@@ -312,13 +340,10 @@ def test_more_clips_than_there_are(study, tmp_path):
         study.run(jobs=0)
 
 
-def test_equal_operations_are_turned_into_steps(store, tmp_path):
-    made = lab.Study(tmp_path / "flops", TWO, seeds=1, budget="tiny", flops=1.5e8, store=store)
-    assert made.run(progress=False)
-    rows = {row["row"]: row for row in made.table().rows}
-    assert 1 <= rows["n2n"]["steps"] < rows["p2n"]["steps"] < 100
-    with pytest.raises(ValueError, match=r"no step fits into \{'flops': 10\}"):
-        lab.Study(tmp_path / "none", TWO, budget="tiny", flops=10, store=store).run(progress=False)
+def test_equal_time_in_place_of_equal_steps(store, tmp_path):
+    made = lab.Study(tmp_path / "minutes", TWO, seeds=1, budget="tiny", minutes=0.02, store=store)
+    assert made.run(progress=False) and lab.Study(tmp_path / "minutes", store=store).plan.budget.recipe.minutes == 0.02
+    assert all(row["steps"] >= 2 for row in made.table().rows)
 
 
 # --- results ------------------------------------------------------------------------------------------------------------

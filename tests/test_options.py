@@ -226,7 +226,7 @@ def lines(sample, folder):
         ["card", run, results, "--hardware", "a core", "--out", folder / "CARD.md", "--name", "mine",
          "--weights", run / "weights.safetensors", "--command", "train", "--allow", "mine",
           "--also", Path(__file__).parents[1] / "README.md"],
-        ["lab", "run", folder / "own.json", "--jobs", 1, "--device", "cpu", "--accept-code"],
+        ["lab", "run", folder / "own.json", "--jobs", 1, "--device", "cpu", "--accept-code", "--allow", "mine"],
         ["lab", "report", folder / "runs" / "own", "--against", "klt", "--metric", "OA", "--out", folder / "report"],
         ["curves", run, run / "log.jsonl", "--out", folder / "curves.png", "--by", "minutes"],
     ]  # fmt: skip

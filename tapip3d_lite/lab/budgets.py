@@ -5,7 +5,7 @@ All sizes stand here: `BUDGETS["lab"]` trains a row in minutes on one core, `"ti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,7 @@ import numpy as np
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.formats import load_clip
 from tapip3d_lite.lab.provenance import plain
-from tapip3d_lite.model.config import SWITCHES
-from tapip3d_lite.parts import import_part
+from tapip3d_lite.parts import allowed_parts
 from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
 from tapip3d_lite.simulate.seeds import STUDIES, TRAINING, VALIDATION
 from tapip3d_lite.training.data import SamplingConfig, query_rows
@@ -64,16 +63,10 @@ class Budget:
         return {"recipe": self.recipe.to_dict(), "scene": plain(self.scene), **rest}
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Budget:
-        """The inverse of `to_dict`."""
-        changed = {"recipe": trusted_recipe(values["recipe"]), "scene": import_part(values["scene"])}
-        return cls(**{**values, **changed})
-
-
-def trusted_recipe(values: Mapping[str, Any]) -> TrainConfig:
-    """A recipe from plain values of a study, whose custom parts (`"module:Class"`) are the user's own."""
-    named = [values["loss"], *(values["tracker"].get(switch, "") for switch in SWITCHES)]
-    return TrainConfig.from_dict(dict(values), [name for name in named if isinstance(name, str) and ":" in name])
+    def from_dict(cls, values: Mapping[str, Any], parts: Sequence[Any] = ()) -> Budget:
+        """The inverse of `to_dict`; what it names of others than the library must be among `parts` (see `load_tracker`)."""
+        scene = allowed_parts(values, ["scene"], ["tapip3d_lite", *parts])
+        return cls(**{**values, **scene, "recipe": TrainConfig.from_dict(values["recipe"], parts)})
 
 
 _LAB = {

@@ -43,8 +43,8 @@ def check_condition(condition: Any) -> Any:
     """
     if callable(condition):
         condition = f"{condition.__module__}:{condition.__qualname__}"
-    if isinstance(condition, str) and not all(part.isidentifier() for part in condition.split(":")[-1:]):
-        raise ValueError(f"degrade: expected a function at the top level of a module, got {condition!r}")
+    if isinstance(condition, str):
+        import_part(condition, "degrade")
     if condition is None or isinstance(condition, str):
         return condition
     if not isinstance(condition, Mapping):

@@ -7,12 +7,11 @@ import errno
 import json
 import multiprocessing
 import statistics
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.evaluation.baselines import TrackerLike
 from tapip3d_lite.evaluation.evaluate import evaluate
-from tapip3d_lite.files import locked, write_text
-from tapip3d_lite.lab.budgets import Budget, Data, judged_clip, trusted_recipe
+from tapip3d_lite.files import write_text
+from tapip3d_lite.lab.budgets import Budget, Data, judged_clip
 from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.lab.train import make_trainer
 from tapip3d_lite.lab.variant import Variant
@@ -31,6 +30,7 @@ from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
 from tapip3d_lite.simulate.dataset import leave_interrupts
 from tapip3d_lite.trackers import load_tracker
+from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.run_folder import read_log
 
 STOPPED, _FULL = "stopped", "the disk is full"
@@ -40,52 +40,40 @@ Stop = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Job:
-    """A training with the rows that are scored by it; plain values, so that another process can do it.
+    """A training with the rows that are scored by it.
 
     Attributes:
         name: for messages.
         folder: of the training; None: the rows' trackers are given.
-        recipe: as a dictionary.
+        recipe: of the training.
         encoder: folder of the encoder that is taken over; None: this job trains it.
-        rows: (row as a dictionary with its name, file of its scores, what stands in it beside the scores).
-        budget: as a dictionary.
+        rows: (row, file of its scores, what stands in it beside the scores).
     """
 
     name: str
     folder: Path | None
-    recipe: dict[str, Any] | None
+    recipe: TrainConfig | None
     encoder: Path | None
-    rows: tuple[tuple[dict[str, Any], Path, dict[str, Any]], ...]
+    rows: tuple[tuple[Variant, Path, dict[str, Any]], ...]
     data: Data
-    budget: dict[str, Any]
+    budget: Budget
     device: str = "cpu"
-
-    @property
-    def custom(self) -> list[Any]:
-        """Custom parts of the recipe."""
-        return [] if self.recipe is None else trusted_recipe(self.recipe).custom
 
     @property
     def steps(self) -> int:
         """Steps of the training."""
-        if self.recipe is None:
-            return 0
-        return self.recipe["steps"] if self.encoder else self.recipe["matching_steps"]
+        return 0 if self.recipe is None else self.recipe.steps if self.encoder else self.recipe.matching_steps
 
 
 def do(job: Job, tell: Tell, stop: Stop) -> str:
     """Do a job in this process: `"done"`, or `"stopped"`, from where the same job goes on exactly."""
-    if job.folder is not None:
-        job.folder.mkdir(parents=True, exist_ok=True)
-        with _alone(job.folder, stop) as alone:
-            if not alone or not _trained(job, tell, stop):
-                return STOPPED
-    clips = [judged_clip(path, Budget.from_dict(job.budget)) for path in job.data.held_out] if job.rows else []
-    for values, file, facts in job.rows:
+    if job.folder is not None and not _trained(job, tell, stop):
+        return STOPPED
+    clips = [judged_clip(path, job.budget) for path in job.data.held_out] if job.rows else []
+    for row, file, facts in job.rows:
         if stop():
             return STOPPED
-        row = Variant(**values)
-        tracker = tracker_of(row, job.folder, job.device, job.custom)
+        tracker = tracker_of(row, job.folder, job.device, job.recipe.custom if job.recipe else ())
         scores = score(tracker, row, clips)
         costs = track_costs(tracker, clips[0], row.options()) | (step_costs(job.folder) if job.folder else {})
         write_text(file, json.dumps({**facts, "device": job.device, "costs": costs, "scores": scores}, indent=1) + "\n")
@@ -96,14 +84,13 @@ def _trained(job: Job, tell: Tell, stop: Stop) -> bool:
     """Train, or go on, until the weights are there; False where it was stopped."""
     weights = job.folder / "weights.safetensors"
     if not weights.exists():
-        recipe, budget = trusted_recipe(job.recipe), Budget.from_dict(job.budget)
-        watched = [judged_clip(path, budget) for path in job.data.watched] if job.encoder else []
+        watched = [judged_clip(path, job.budget) for path in job.data.watched] if job.encoder else []
         options = {"device": job.device, "resume": True, "encoder": job.encoder}
-        trainer = make_trainer(job.folder, recipe, job.data.train, watched, **options)
+        trainer = make_trainer(job.folder, job.recipe, job.data.train, watched, **options)
         first = job.encoder is None  # the encoder's job ends with the first stage
 
         def halt() -> bool:
-            tell(trainer.step)
+            tell(int(trainer.schedule.position))
             return stop() or (first and not trainer.schedule.matching)
 
         if trainer.schedule.matching or not first:
@@ -159,57 +146,54 @@ def step_costs(folder: Path) -> dict[str, float]:
     return {"steps": len(taken), "step_ms": round(1000 * statistics.median(taken), 2)}
 
 
-def probe(job: Job, folder: Path) -> tuple[float, float]:
-    """Seconds and floating-point operations of a training step (the median, the mean), tried in a folder of its own."""
-    recipe = trusted_recipe({**job.recipe, "steps": 8, "short": 0.0, "validation": 0, "save_every": 100})
-    trainer = make_trainer(folder, recipe, job.data.train, device=job.device, encoder=job.encoder)
-    steps = trainer.steps()
-    with FlopCounterMode(display=False) as counter:
-        seconds = [next(steps)["seconds"] for _ in range(3)]
-    seconds = [*seconds[-1:], *(line["seconds"] for line in steps)]
-    taken = statistics.median(b - a for a, b in pairwise(seconds))
-    return taken, counter.get_total_flops() / 3
-
-
 def do_all(jobs: Sequence[Job], processes: int, tell: Callable[[str, int], None], stop: Stop) -> dict[str, str]:
     """Do jobs, at most so many at once; what became of each: `"done"`, `"stopped"`, or one line that says what failed.
 
     A job that fails, or whose process dies, leaves the others alone. A full disk stops all: ValueError.
     """
-    ended, running, waiting, context = {}, {}, list(jobs), multiprocessing.get_context("spawn")
+    ended: dict[str, str] = {}
+
+    def halt() -> bool:
+        return stop() or _FULL in ended.values()
+
+    def one(job: Job) -> None:
+        work = _tried if processes == 1 else _elsewhere
+        ended[job.name] = STOPPED if halt() else work(job, partial(tell, job.name), halt)
+
     if processes == 1:
         for job in jobs:
-            ended[job.name] = STOPPED if stop() else _unless_full(_tried(job, partial(tell, job.name), stop))
-        return ended
-    try:
-        while waiting or running:
-            if stop():
-                ended |= {job.name: STOPPED for job in waiting}
-                waiting = []
-                for connection in running:
-                    with contextlib.suppress(OSError):
-                        connection.send(STOPPED)
-            while waiting and len(running) < processes:
-                ours, theirs = context.Pipe()
-                process = context.Process(target=_in_process, args=(waiting[0], theirs), daemon=True)
-                running[ours] = process, waiting.pop(0)
-                process.start()
-                theirs.close()
-            for connection in wait(list(running), 0.2):
-                process, job = running[connection]
-                outcome = _heard(connection, process)
-                if isinstance(outcome, int):
-                    tell(job.name, outcome)
-                    continue
-                process.join()
-                del running[connection]
-                ended[job.name] = _unless_full(outcome)
-    finally:
-        for connection, (process, _) in running.items():  # after a second Ctrl-C, or where the disk is full
-            process.terminate()
-            process.join()
-            connection.close()
+            one(job)
+    else:
+        with ThreadPoolExecutor(processes) as threads:  # each waits for a process
+            list(threads.map(one, jobs))
+    if _FULL in ended.values():
+        raise ValueError(f"Study: {_FULL}; make room and run it again: what was saved is kept, and it goes on there")
     return ended
+
+
+def _elsewhere(job: Job, tell: Tell, stop: Stop) -> str:
+    """What became of a job in a process of its own, which says steps done, and at last how the job ended."""
+    context, asked = multiprocessing.get_context("spawn"), False
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_in_process, args=(job, theirs), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        while True:
+            if stop() and not asked:
+                asked = True
+                ours.send(STOPPED)
+            if ours.poll(0.2):
+                said = ours.recv()
+                if isinstance(said, str):
+                    return said
+                tell(said)
+    except (EOFError, OSError):  # a dead one says nothing
+        process.join()
+        killed = f"by signal {-process.exitcode}, e.g. out of memory" if process.exitcode < 0 else "with an error"
+        return f"its process ended {killed}"
+    finally:
+        process.join()
 
 
 def _in_process(job: Job, connection: Any) -> None:
@@ -223,52 +207,14 @@ def _in_process(job: Job, connection: Any) -> None:
     say(_tried(job, say, connection.poll))
 
 
-def _heard(connection: Any, process: Any) -> int | str:
-    """What a worker says: steps done, or how the job ended, which a dead one cannot say."""
-    try:
-        return connection.recv()
-    except (EOFError, OSError):
-        process.join()
-        killed = f"by signal {-process.exitcode}, e.g. out of memory" if process.exitcode < 0 else "with an error"
-        return f"its process ended {killed}"
-
-
 def _tried(job: Job, tell: Tell, stop: Stop) -> str:
     """What became of a job; one thread does it, so that several at once leave each other alone, and sums have one order."""
-    threads, told = torch.get_num_threads(), [0.0]
-
-    def now_and_then(steps: int) -> None:
-        if time.monotonic() - told[0] > 0.3 or steps == job.steps:
-            told[0] = time.monotonic()
-            tell(steps)
-
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return do(job, now_and_then, stop)
+        return do(job, tell, stop)
     except Exception as error:  # whatever a custom part raises
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
         return _FULL if full else f"{type(error).__name__}: {error}".splitlines()[0]
     finally:
         torch.set_num_threads(threads)
-
-
-def _unless_full(outcome: str) -> str:
-    if outcome == _FULL:
-        raise ValueError(f"Study: {_FULL}; make room and run it again: what was saved is kept, and it goes on there")
-    return outcome
-
-
-@contextlib.contextmanager
-def _alone(folder: Path, stop: Stop) -> Iterator[bool]:
-    """Wait until no other process works in a folder; a lock that its death releases. False where it was stopped."""
-    with contextlib.ExitStack() as held:
-        while True:
-            try:
-                held.enter_context(locked(folder / ".job", "Study: a training"))
-                break
-            except ValueError:
-                if stop():
-                    yield False
-                    return
-                time.sleep(0.2)
-        yield True

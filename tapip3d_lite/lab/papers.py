@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +17,21 @@ TABLES: dict[str, dict[str, Any]] = {
 }
 """The paper's tables: `rows` by name, each with the arguments of `Variant`; `against`, and other arguments of `Study`."""
 
-_FIELDS = ("folder", "rows", "against", "seeds", "budget", "steps", "minutes", "flops", "store")
+_FIELDS = ("folder", "rows", "against", "seeds", "budget", "steps", "minutes", "store")
 
 
-def open_study(source: str | Path, accept_code: bool = False) -> tuple[Study, str | None]:
+def open_study(source: str | Path, accept_code: bool = False, parts: Sequence[Any] = ()) -> tuple[Study, str | None]:
     """A study, and the row that others are compared with, from a name of `TABLES`, a TOML or JSON file, or a folder.
 
-    A file's `folder`, `store` and `data` are relative to it; without a `folder` the study is in `runs/<name>`.
+    A file's `folder` and `store` are relative to it; without a `folder` the study is in `runs/<name>`. Custom parts that
+    files name must be among `parts`, as for `load_tracker`.
 
     Raises:
         ValueError: neither of these, an unreadable file, unknown fields, or what `Study` refuses.
     """
     path = Path(source)
     if (path / "study.json").exists():
-        return Study(path, accept_code=accept_code), None
+        return Study(path, accept_code=accept_code, parts=parts), None
     if path.suffix not in (".toml", ".json"):
         check_names(
             "lab: neither a file (.toml, .json), nor a study's folder, nor a table of the paper", [str(source)], TABLES
@@ -43,11 +44,12 @@ def open_study(source: str | Path, accept_code: bool = False) -> tuple[Study, st
     rows = values.get("rows", {})
     if not isinstance(rows, Mapping) or not all(isinstance(row, Mapping) for row in rows.values()):
         raise ValueError(f"{source}: expected rows by name, e.g. [rows.p2n] with context = 'p2n' below, got {rows!r}")
-    kept = {k: v for k, v in values.items() if k in ("seeds", "budget", "steps", "minutes", "flops")}
+    kept = {k: v for k, v in values.items() if k in ("seeds", "budget", "steps", "minutes")}
     if "store" in values:
         kept["store"] = home / values["store"]
     folder = home / values.get("folder", Path("runs") / path.stem)
-    study = Study(folder, [Variant(name, **row) for name, row in rows.items()], **kept, accept_code=accept_code)
+    rows = [Variant.from_dict(name, row, parts) for name, row in rows.items()]
+    study = Study(folder, rows, **kept, accept_code=accept_code, parts=parts)
     return study, values.get("against")
 
 

@@ -8,7 +8,6 @@ store/trainings/s0-<key>/    of a recipe with seed 0; rows and studies with the 
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from urllib.parse import quote
 
 from tapip3d_lite.files import digest, read_json, write_text
 from tapip3d_lite.lab.budgets import Budget, Data, simulated
-from tapip3d_lite.lab.jobs import Job, probe
+from tapip3d_lite.lab.jobs import Job
 from tapip3d_lite.lab.provenance import diff, own_code, source_code
 from tapip3d_lite.lab.variant import Variant
 from tapip3d_lite.training.recipe import TrainConfig
@@ -30,17 +29,15 @@ _MATCHING = (
 
 @dataclass
 class Plan:
-    """What a study was made with; everything but rows, seeds and steps stays as it was.
+    """What a study was made with; everything but rows and seeds stays as it was.
 
     Attributes:
         folder, store: of the study, and of what it can share.
         rows: by name.
         seeds: number of trainings of each row.
         budget: what rows have in common.
-        limit: `{"minutes": …}` or `{"flops": …}`, where not the number of steps is equal.
         code: digests of the sources.
         clips: digests of the clips, once there are some.
-        steps: by recipe, where the limit determines them.
     """
 
     folder: Path
@@ -48,16 +45,19 @@ class Plan:
     rows: dict[str, Variant]
     seeds: int
     budget: Budget
-    limit: dict[str, float]
     code: dict[str, str] = field(default_factory=source_code)
     clips: dict[str, str] | None = None
-    steps: dict[str, int] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as `study.json` holds them."""
         rows = {name: row.to_dict() for name, row in self.rows.items()}
-        kept = {name: getattr(self, name) for name in ("seeds", "limit", "clips", "steps", "code")}
-        return {"rows": rows, "budget": self.budget.to_dict(), **kept}
+        return {
+            "rows": rows,
+            "budget": self.budget.to_dict(),
+            "seeds": self.seeds,
+            "clips": self.clips,
+            "code": self.code,
+        }
 
     def check_rows(self) -> None:
         """Raise ValueError for a row that cannot be built."""
@@ -68,13 +68,10 @@ class Plan:
     def take_over(self, old: Mapping[str, Any], accept_code: bool) -> None:
         """Refuse (ValueError) an old plan that differs in what must be equal; take over what it knows."""
         ours, rows = self.to_dict(), [name for name in self.rows if name in old["rows"]]
-        one, other = (
-            {**{k: x[k] for k in ("budget", "limit")}, "rows": {n: x["rows"][n] for n in rows}} for x in (old, ours)
-        )
-        if found := diff(one, other):
+        if found := diff(*({"budget": x["budget"], "rows": {n: x["rows"][n] for n in rows}} for x in (old, ours))):
             text = ", ".join(f"{name}={a!r} (now {b!r})" for name, (a, b) in found.items())
             raise ValueError(
-                f"Study: {self.folder} was made otherwise: {text}; use its values, other names or another folder"
+                f"Study: {self.folder} was made otherwise: {text}; use its values, or other names or folders"
             )
         changed = diff(old["code"], self.code)
         if changed and not accept_code:
@@ -82,7 +79,7 @@ class Plan:
                 f"Study: {self.folder} was made by other code: {', '.join(changed)} differ; use that code or another folder, or "
                 "accept_code=True, which keeps its results and goes on"
             )
-        self.clips, self.steps = old["clips"], old["steps"]
+        self.clips = old["clips"]
 
     def save(self) -> None:
         """Write `study.json`; rows and seeds that only an older plan has stay in it."""
@@ -98,17 +95,14 @@ class Plan:
         found = {name: digest(*(path.read_bytes() for path in paths)) for name, paths in asdict(data).items()}
         if self.clips not in (None, found):
             changed = ", ".join(diff(self.clips, found))
-            raise ValueError(
-                f"Study: clips differ from those that {self.folder} was made with: {changed}; use another folder"
-            )
+            raise ValueError(f"Study: clips ({changed}) differ from those of {self.folder}; use another folder")
         self.clips = found
         self.save()
         return data
 
     def recipe(self, row: Variant, seed: int = 0) -> TrainConfig:
         """What is trained for a row and seed, given an encoder."""
-        recipe = replace(row.recipe(self.budget.recipe), seed=seed, matching_steps=0)
-        return replace(recipe, steps=self.steps.get(_any_seed(recipe), recipe.steps))
+        return replace(row.recipe(self.budget.recipe), seed=seed, matching_steps=0)
 
     def encoders(self, data: Data, device: str) -> list[Job]:
         """The encoders that are still to be trained."""
@@ -122,25 +116,9 @@ class Plan:
         base, wanted = self.budget.recipe, row.recipe(self.budget.recipe)
         sizes = {name: wanted.tracker[name] for name in _ENCODER if name in wanted.tracker}
         kept = {name: getattr(base, name) for name in _MATCHING}
-        recipe = TrainConfig(**kept, tracker={**base.tracker, **sizes}, steps=1, validation=0).to_dict()
-        folder = self.store / "encoders" / digest(json.dumps(recipe), self.clips["train"])
-        return Job("the encoder", folder, recipe, None, (), data, self.budget.to_dict(), device)
-
-    def divide(self, data: Data, device: str) -> None:
-        """Where rows have time or operations in common: find the steps that each may make; ValueError where it is none."""
-        for row in self.rows.values() if self.limit else ():
-            if row.given is not None or (key := _any_seed(self.recipe(row))) in self.steps:
-                continue
-            with tempfile.TemporaryDirectory(dir=self.folder) as folder:
-                seconds, flops = probe(self._training(row, 0, data, device), Path(folder))
-            steps = int(self.limit["flops"] / flops if "flops" in self.limit else 60 * self.limit["minutes"] / seconds)
-            if steps < 1:
-                need = f"{seconds / 60:.2g} minutes and {flops:.2g} operations"
-                raise ValueError(
-                    f"Study: a step of row {row.name!r} takes {need}; no step fits into {self.limit}; give more"
-                )
-            self.steps[key] = steps
-            self.save()
+        recipe = TrainConfig(**kept, tracker={**base.tracker, **sizes}, steps=1, validation=0)
+        folder = self.store / "encoders" / digest(json.dumps(recipe.to_dict()), self.clips["train"])
+        return Job("the encoder", folder, recipe, None, (), data, self.budget, device)
 
     def trainings(self, data: Data, device: str) -> list[Job]:
         """All that is still to be trained and scored, seed by seed; rows of one recipe share a job."""
@@ -153,18 +131,18 @@ class Plan:
                 if is_scored(self.result(row, seed), key):
                     continue
                 job = found.get(job.folder or row.name, job)
-                rows = (*job.rows, ({"name": row.name, **row.to_dict()}, self.result(row, seed), facts))
-                found[job.folder or row.name] = replace(job, rows=rows)
+                found[job.folder or row.name] = replace(job, rows=(*job.rows, (row, self.result(row, seed), facts)))
         return list(found.values())
 
     def _training(self, row: Variant, seed: int, data: Data | None = None, device: str = "cpu") -> Job:
         """The training of a row with a seed, without what is scored by it."""
         if row.given is not None:
-            return Job(row.name, None, None, None, (), data, self.budget.to_dict(), device)
-        recipe, encoder = self.recipe(row, seed).to_dict(), self._encoder(row, data, device).folder
-        key = digest(json.dumps([recipe, own_code(recipe)]), encoder.name, self.clips["train"])
+            return Job(row.name, None, None, None, (), data, self.budget, device)
+        recipe, encoder = self.recipe(row, seed), self._encoder(row, data, device).folder
+        values = recipe.to_dict()
+        key = digest(json.dumps([values, own_code(values)]), encoder.name, self.clips["train"])
         folder = self.store / "trainings" / f"s{seed}-{key}"
-        return Job(f"{row.name} s{seed}", folder, recipe, encoder, (), data, self.budget.to_dict(), device)
+        return Job(f"{row.name} s{seed}", folder, recipe, encoder, (), data, self.budget, device)
 
     def _key(self, row: Variant, job: Job) -> str:
         """What a row's scores depend on."""
@@ -190,7 +168,3 @@ def is_scored(file: Path, key: str) -> bool:
     """Whether a file holds scores with that key."""
     one = read_json(file) if file.exists() else {}
     return "scores" in one and one["key"] == key
-
-
-def _any_seed(recipe: TrainConfig) -> str:
-    return digest(json.dumps({**recipe.to_dict(), "steps": 0, "seed": 0}))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 import json
+import re
+import sys
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -31,18 +31,9 @@ def plain(value: Any) -> Any:
 
 
 def own_code(values: Any) -> dict[str, str]:
-    """Digests of the source files of the custom parts, `"module:name"`, that plain values name; `__main__` has none."""
-    if isinstance(values, Mapping | list | tuple):
-        found = [own_code(x) for x in (values.values() if isinstance(values, Mapping) else values)]
-        return {name: code for one in found for name, code in one.items()}
-    module, _, name = values.partition(":") if isinstance(values, str) else ("", "", "")
-    if not name.isidentifier() or module == "__main__":
-        return {}
-    try:
-        origin = importlib.util.find_spec(module).origin
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"{values}: no module {module!r}; run where it can be imported") from error
-    return {module: digest(Path(origin).read_bytes())}
+    """Digests of the files of the modules, which are imported, whose parts plain values name; `__main__` has none."""
+    named = sorted({*re.findall(r'"([^\W\d][\w.]*):[^\W\d][\w.]*"', json.dumps(values))} - {"__main__"})
+    return {module: digest(Path(sys.modules[module].__file__).read_bytes()) for module in named}
 
 
 def diff(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:
@@ -78,7 +69,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 @cache
 def source_code() -> dict[str, str]:
-    """Digests of the library's sources that scores depend on, without comments and docstrings, and versions of packages.
+    """Digests of the library's sources that scores depend on, and versions of packages.
 
     They are read once, since a process keeps the code that it began with.
     """
@@ -86,14 +77,5 @@ def source_code() -> dict[str, str]:
     for path in sorted(_ROOT.rglob("*.py")):
         name = path.relative_to(_ROOT).as_posix()
         if name.removesuffix(".py").split("/")[0] not in _UNSEEN or name in _SEEN:
-            found[name] = digest(_spoken(path.read_text(encoding="utf-8")))
+            found[name] = digest(path.read_bytes())
     return found
-
-
-def _spoken(source: str) -> str:
-    """A source's syntax tree without docstrings, so that only a change of what it does changes the text."""
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
-            node.body = node.body[1:]
-    return ast.dump(tree)

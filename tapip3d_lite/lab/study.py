@@ -48,9 +48,9 @@ class Study:
         budget: str | Budget | None = None,
         steps: int | None = None,
         minutes: float | None = None,
-        flops: float | None = None,
         store: str | Path | None = None,
         accept_code: bool = False,
+        parts: Sequence[Any] = (),
     ) -> None:
         """Plan a study, or open one; nothing is computed yet. What a folder's study has, need not be given again.
 
@@ -60,10 +60,11 @@ class Study:
             seeds: number of trainings of each row; by default 3.
             budget: a name of `BUDGETS`, by default `"lab"`, or one's own.
             steps: of every row, in place of the budget's.
-            minutes: of training steps of every row, on one core; each row gets as many steps as it makes in this time.
-            flops: floating-point operations of the training of every row; each row gets as many steps as these allow.
+            minutes: that the training of every row takes, on one core, in however many steps.
             store: what studies can share; by default `folder / "store"`.
             accept_code: go on with results of other code; each result says with which code it was made.
+            parts: custom parts, or modules, that rows and budget of the folder may name, as for `load_tracker`; what the
+                caller gives again needs none.
 
         Raises:
             ValueError: no rows, two of one name, rows that cannot be built, a bad number, or a folder of other rows of
@@ -75,24 +76,23 @@ class Study:
             raise ValueError(
                 f"Study: {folder} holds no study; give rows, e.g. [Variant('n2n'), Variant('p2n', context='p2n')]"
             )
-        rows = [Variant(name, **values) for name, values in old["rows"].items()] if rows is None else list(rows)
+        if rows is None:
+            rows = [Variant.from_dict(name, values, parts) for name, values in old["rows"].items()]
         names = [row.name for row in rows]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"Study: two rows are called {', '.join(twice)}; rename one")
-        limits = {k: v for k, v in (("steps", steps), ("minutes", minutes), ("flops", flops)) if v is not None}
-        if not rows or len(limits) > 1 or any(value <= 0 for value in limits.values()):
+        changes = {k: v for k, v in (("steps", steps), ("minutes", minutes)) if v is not None}
+        if not rows or len(changes) > 1:
             raise ValueError(
-                f"Study: expected rows, and at most one positive number of steps, minutes or flops; got {limits}"
+                f"Study: expected rows, and at most one of steps and minutes; got {len(rows)} rows, {changes}"
             )
         seeds = seeds if seeds is not None else old["seeds"] if old else 3
         if not isinstance(seeds, int) or seeds < 1:
             raise ValueError(f"Study.seeds: expected a number of trainings of at least 1, got {seeds!r}")
-        budget = _chosen(budget, old)
-        if steps is not None:
-            budget = replace(budget, recipe=replace(budget.recipe, steps=limits.pop("steps")))
-        limit = old["limit"] if old and not limits and steps is None else limits
+        budget = _chosen(budget, old, parts)
+        budget = replace(budget, recipe=replace(budget.recipe, **changes))
         store = Path(store) if store else folder / "store"
-        self.plan = Plan(folder, store, dict(zip(names, rows, strict=True)), seeds, budget, limit)
+        self.plan = Plan(folder, store, dict(zip(names, rows, strict=True)), seeds, budget)
         self.plan.check_rows()
         self._data: Data | None = None
         if old is not None:
@@ -116,7 +116,7 @@ class Study:
             Whether all rows are finished; rows that failed count as finished.
 
         Raises:
-            ValueError: clips that are too few or have changed, a budget into which no step fits, a full disk.
+            ValueError: clips that are too few or have changed, a full disk.
         """
         if jobs < 1:
             raise ValueError(f"Study.run: expected at least one job, got {jobs}")
@@ -129,12 +129,11 @@ class Study:
                 return False
             if failed:
                 raise ValueError(f"Study: the encoder could not be trained: {'; '.join(failed.values())}")
-            plan.divide(data, device)
             todo = plan.trainings(data, device)
             failed = work(todo)
         for job in (job for job in todo if failed and job.name in failed):
             for row, file, facts in (one for one in job.rows if not is_scored(one[1], one[2]["key"])):
-                values = {**facts, "row": row["name"], "failed": failed[job.name]}
+                values = {**facts, "row": row.name, "failed": failed[job.name]}
                 write_text(file, json.dumps(values, indent=1) + "\n")
         return failed is not None
 
@@ -194,11 +193,11 @@ class Study:
         return explorer(list(self.plan.rows), self.plan.seeds, clips, self.draw)
 
 
-def _chosen(budget: str | Budget | None, old: dict[str, Any] | None) -> Budget:
+def _chosen(budget: str | Budget | None, old: dict[str, Any] | None, parts: Sequence[Any]) -> Budget:
     if isinstance(budget, Budget):
         return budget
     if budget is None and old is not None:
-        return Budget.from_dict(old["budget"])
+        return Budget.from_dict(old["budget"], parts)
     check_names("Study.budget", [budget or "lab"], BUDGETS)
     return BUDGETS[budget or "lab"]
 

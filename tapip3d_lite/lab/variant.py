@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tapip3d_lite.lab.conditions import check_condition
 from tapip3d_lite.lab.provenance import plain
-from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.config import SWITCHES, TrackerConfig
 from tapip3d_lite.model.track import track as _track
+from tapip3d_lite.parts import allowed_parts
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.validate import check_names
 
@@ -84,9 +87,7 @@ class Variant:
         tracker = {name: value for name, value in self.fields.items() if name in _TRACKER}
         changes = {name: value for name, value in self.fields.items() if name in _TRAIN}
         if "iterations" in tracker:
-            tracker["iterations"] = (
-                max(changes["iterations"]) if _pair(changes["iterations"]) else changes["iterations"]
-            )
+            tracker["iterations"] = int(np.max(changes["iterations"]))
         for name, value in changes.items():
             part = getattr(base, name)
             if is_dataclass(part) and isinstance(value, Mapping):
@@ -112,6 +113,7 @@ class Variant:
         values = {"tracker": self.given, "track": self.track, "degrade": self.degrade} | dict(self.fields)
         return json.loads(json.dumps({k: v for k, v in values.items() if v not in (None, {})}, default=plain))
 
-
-def _pair(value: Any) -> bool:
-    return isinstance(value, tuple | list)
+    @classmethod
+    def from_dict(cls, name: str, values: Mapping[str, Any], parts: Sequence[Any] = ()) -> Variant:
+        """The inverse of `to_dict`; custom parts and conditions that it names must be among `parts` (see `load_tracker`)."""
+        return cls(name, **{**values, **allowed_parts(values, (*SWITCHES, "loss", "degrade"), parts)})
