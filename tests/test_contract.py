@@ -25,7 +25,6 @@ BUILT_IN = [(switch, name) for switch, names in (PARTS | {"loss": FORMS}).items(
 def test_every_built_in_part_passes(switch, name):
     report = lab.check_part(name, switch)
     assert report.ok and str(report).startswith(f"{name} ({switch}): keeps the contract"), report
-    assert bool(report.notes) == (name in ("uv", "uvd"))  # these two look at values
 
 
 # --- one good part of each switch, and ways to break it: a class that inherits from it and breaks one thing ----------
@@ -108,54 +107,10 @@ class Normed(Layer):
         return self.norm(x.flatten(0, 2)).view(x.shape)
 
 
-class Hidden:
-    """Something remembered that can be cut, but has no `map`."""
-
-    def __init__(self, x):
-        self.x = x
-
-    def __getitem__(self, rows):
-        return Hidden(self.x[rows])
-
-
-class Hiding(Mean):
-    def __init__(self, config):
-        super().__init__(config)
-        self.embed = nn.Linear(config.feature_dim, config.feature_dim)
-
-    def describe(self, index, support):
-        return Hidden(self.embed(support.features[..., 0, :]))
-
-    def forward(self, index, kept, near):
-        return super().forward(index, kept.x, near)
-
-
 class Blind(Mean):
     def prepare(self, index, level):
         share = level.valid.float().mean((2, 3))[..., None, None, None]
         return replace(level, features=level.features / share)
-
-
-class Unused(Layer):
-    def __init__(self, config, inputs):
-        super().__init__(config, inputs)
-        self.more = nn.Linear(2, 2)
-
-
-class Remembering(Layer):
-    seen = 0.0
-
-    def change(self, x, active):
-        self.seen = 0.5 * self.seen + x.detach().mean()
-        return x - self.seen
-
-
-class RememberingContext(Mean):
-    seen = 0.0
-
-    def change(self, x, near):
-        self.seen = 0.5 * self.seen + x.detach().mean()
-        return x - self.seen
 
 
 class NoWidth(Mean):
@@ -230,15 +185,15 @@ BROKEN = [
     ("context", "device", context(lambda self, x, near: x + torch.zeros(self.width)), "made on the CPU"),
     ("neighborhood", "device", neighborhood(lambda self, near, *_: replace(near, points=near.points + torch.zeros(3))), "add"),
     ("updater", "device", updater(lambda self, x, _: x * torch.ones(4)), "mul"),
+    ("updater", "device", updater(lambda self, x, _: x @ torch.eye(4)), "two devices"),
     ("updater", "device", updater(lambda self, x, _: torch.zeros(x.shape) + 1e-9 * float(x.shape[0])), "on the CPU"),
     ("space", "device", lift(lambda x: x + torch.zeros(3)), "made on the CPU"),
     ("loss", "device", loss(lambda self, x, counted: MEAN(self, x * torch.ones(x.shape[1:]), counted)), "made on the CPU"),
     ("updater", "device", updater(lambda self, x, _: x + float(np.mean(x.detach().numpy())) * 0), "values are taken to the CPU"),
-    ("updater", "device", type("Broken", (Layer,), {"sync_free": True, "change": lambda self, x, _: x * bool(x.sum() < 1e9)}), "sync_free"),
     # numbers
     ("context", "finite", context(lambda self, x, near: x.log()), "for ordinary inputs"),
-    ("context", "finite", Blind, "where no cell of a frame is valid"),
-    ("neighborhood", "finite", neighborhood(lambda self, near, *_: replace(near, features=near.features / near.points.std((-1, -2), keepdim=True))), "no cell"),
+    ("context", "finite", Blind, "where a frame has no depth"),
+    ("neighborhood", "finite", neighborhood(lambda self, near, *_: replace(near, features=near.features / near.points.std((-1, -2), keepdim=True))), "no depth"),
     ("updater", "finite", updater(lambda self, x, active: x / active.float().mean()), "without an active track"),
     ("space", "finite", lift(lambda x: x / (x[..., 2:] - x[..., 2:].amin((-2, -3), keepdim=True)).clamp(max=1.0)), "lift"),
     ("loss", "finite", loss(lambda self, x, counted: (x * counted).sum() / counted.sum()), "without an active track"),
@@ -257,10 +212,9 @@ BROKEN = [
     # gradients
     ("context", "gradient", context(lambda self, x, near: x.detach()), "no gradient at all"),
     ("context", "gradient", context(lambda self, x, near: x - near.features.mean((-1, -2)).unsqueeze(-1).detach()), None),
-    ("context", "gradient", type("Broken", (Mean,), {"describe": lambda self, index, support: support.features[..., 0, :].detach()}), "depend on support"),
+    ("context", "gradient", type("Broken", (Mean,), {"describe": lambda self, index, support: support.features[..., 0, :].detach()}), "depend on own"),
     ("context", "gradient", type("Broken", (Mean,), {"prepare": lambda self, index, level: replace(level, features=level.features.detach())}), "depend on features"),
     ("neighborhood", "gradient", neighborhood(lambda self, near, *_: replace(near, features=near.features.detach())), "no gradient at all"),
-    ("updater", "gradient", Unused, "no gradient reaches the parameter more.weight, more.bias"),
     ("updater", "gradient", updater(lambda self, x, _: x.round()), "gradient"),
     ("space", "gradient", world(lambda x: x.detach()), "no gradient at all"),
     ("loss", "gradient", loss(lambda self, x, counted: MEAN(self, x.detach(), counted)), "no gradient at all"),
@@ -270,9 +224,6 @@ BROKEN = [
     ("updater", "random", updater(lambda self, x, _: x + np.random.default_rng().random()), "two calls"),
     ("space", "random", lift(lambda x: x + torch.randn_like(x)), "two calls"),
     ("loss", "random", loss(lambda self, x, counted: MEAN(self, x, counted) * torch.rand(())), "two calls"),
-    ("context", "memory", RememberingContext, "calls before"),
-    ("updater", "memory", Remembering, "calls before"),
-    ("context", "call", type("Broken", (Mean,), {"prepare": lambda self, index, level: replace(level, features=level.features.mul_(2))}), "writes into its input 'features'"),
     # values that are defined
     ("neighborhood", "values", neighborhood(lambda self, near, *_: replace(near, center=near.center + 1)), "center"),
     ("neighborhood", "values", neighborhood(lambda self, near, *_: replace(near, indices=near.indices + 10**6)), "indices lie outside"),
@@ -290,7 +241,6 @@ BROKEN = [
     ("updater", "call", type("Broken", (Layer,), {"forward": lambda self, tokens: self.layer(tokens)}), "forward(tokens, active)"),
     ("loss", "call", lambda step, truth, iterations: step.logits.mean(), "not a tuple (position, visibility)"),
     ("space", "call", type("Broken", (), {name: lambda self: None for name in ("lift", "from_world", "to_world", "to_pixels")}), "lift, from_world"),
-    ("context", "training", Hiding, "describe returns"),
 ]  # fmt: skip
 
 
@@ -298,7 +248,7 @@ BROKEN = [
 def test_the_parts_that_are_broken_below_pass_as_they_are(switch, part):
     started = time.process_time()
     report = lab.check_part(part)
-    assert report.ok and not report.notes and report.switch == switch, report
+    assert report.ok and report.switch == switch, report
     assert time.process_time() - started < 4
 
 

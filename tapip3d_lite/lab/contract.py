@@ -6,15 +6,18 @@ types, devices, finite numbers, one clip apart from another, gradients, the same
 
 from __future__ import annotations
 
+import copy
 import inspect
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
-from tapip3d_lite.lab.faults import examine, said
-from tapip3d_lite.lab.probes import CALLS, Holder, make_probe
+from tapip3d_lite.lab.probes import PROBES, Holder, Probe, Tensors, poor_inputs, random_inputs
 from tapip3d_lite.model.config import SWITCHES, TrackerConfig
 from tapip3d_lite.model.n2n import Context
 from tapip3d_lite.model.registry import PARTS
@@ -23,6 +26,7 @@ from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.parts import find_part, make_part
 from tapip3d_lite.training.loss import FORMS, LossConfig
 
+Faults = Iterator[tuple[str, str]]
 _TINY = {
     "image_size": (24, 32), "window": 4, "feature_dim": 12, "stride": 2, "levels": 2, "neighbors": 5, "token_dim": 10,
     "context_head_dim": 6, "offset_layers": 2, "offset_dim": 8, "hidden": 14, "heads": 2, "head_dim": 7, "time_depth": 1,
@@ -49,13 +53,11 @@ class PartReport:
         part: its name.
         switch: whose contract it was held to.
         faults: one sentence by kind, e.g. `"shape"` or `"batch"`; what comes after a fault may not have been tried.
-        notes: what is allowed and good to know.
     """
 
     part: str
     switch: str | None
     faults: dict[str, str] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
 
     @property
     def ok(self) -> bool:
@@ -63,10 +65,9 @@ class PartReport:
         return not self.faults
 
     def __str__(self) -> str:
-        head = f"{self.part} ({self.switch or 'unknown switch'}): "
-        head += "keeps the contract" if self.ok else f"{len(self.faults)} fault{'s' if len(self.faults) > 1 else ''}"
-        lines = [f"{kind}: {text}" for kind, text in self.faults.items()] + [f"note: {text}" for text in self.notes]
-        return "\n- ".join([head, *lines])
+        count = f"{len(self.faults)} fault{'s' if len(self.faults) > 1 else ''}"
+        head = f"{self.part} ({self.switch or 'unknown switch'}): {'keeps the contract' if self.ok else count}"
+        return "\n- ".join([head, *(f"{kind}: {text}" for kind, text in self.faults.items())])
 
     __repr__ = __str__
 
@@ -91,27 +92,21 @@ def check_part(part: Any, switch: str | None = None, config: TrackerConfig | Non
         names = {name for known in PARTS.values() for name in known} | set(FORMS)
         part = find_part("part", part, sorted(names))
         report = replace(report, switch=switch or _guess(part))
-        if report.switch not in (*SWITCHES, "loss"):
-            wanted = ", ".join((*SWITCHES, "loss"))
-            report.faults["switch"] = f"it is not clear what this is for; say switch= one of {wanted}, got {switch!r}"
+        if report.switch not in PROBES:
+            wanted = f"say switch= one of {', '.join(PROBES)}, got {switch!r}"
+            report.faults["switch"] = f"it is not clear what this is for; {wanted}"
             return report
-        config = _config(report.switch, part, config)
         with torch.random.fork_rng(devices=[]), torch.inference_mode(False), torch.enable_grad():
             torch.manual_seed(seed)
-            owner = _owner(report.switch, part, config)
-            probe = make_probe(report.switch, owner, config, torch.Generator().manual_seed(seed))
-            examine(probe, report.switch, config, report.faults, report.notes)
+            owner, config = _owner(report.switch, part, config)
+            given = random_inputs(config, torch.Generator().manual_seed(seed), _channels(owner))
+            _examine(PROBES[report.switch], report.switch, owner, given, report.faults)
     except Exception as error:  # the part's own code may raise anything
-        kind = "call" if "owner" in locals() else "constructor"
-        report.faults.setdefault(kind, f"{said(error)}; expected {_wanted(report.switch, kind)}")
+        made = "owner" in locals()
+        probe = PROBES.get(report.switch)
+        expected = "" if probe is None else probe.contract if made else f"a function, or a class made by {probe.made}"
+        report.faults.setdefault("call" if made else "constructor", f"{_said(error)}; expected {expected}")
     return report
-
-
-def _wanted(switch: str | None, kind: str) -> str:
-    if kind == "call":
-        return CALLS[switch]
-    made = {"space": "()", "loss": "()", "updater": "(config, inputs)"}.get(switch, "(config)")
-    return f"an instance, a function, or a class that is made by {made}"
 
 
 def _guess(part: Any) -> str | None:
@@ -130,15 +125,167 @@ def _guess(part: Any) -> str | None:
     return next((switch for switch, names in _ARGUMENTS.items() if names <= given), None)
 
 
-def _config(switch: str, part: Any, config: TrackerConfig | None) -> TrackerConfig:
-    own = {} if switch == "loss" else {switch: part}
-    if config is not None:
-        return config.replace(**own)
+def _owner(switch: str, part: Any, config: TrackerConfig | None) -> tuple[nn.Module, TrackerConfig]:
+    """What has the part, in evaluation mode, and the sizes of its inputs."""
     companions = _COMPANIONS.get((switch, part), {}) if isinstance(part, str) else {}
-    return TrackerConfig(**(_TINY | companions | own))
+    own = {} if switch == "loss" else {switch: part}
+    config = TrackerConfig(**(_TINY | companions | own)) if config is None else config.replace(**own)
+    if switch == "loss":
+        return Holder(LossConfig(form=part) if isinstance(part, str) else make_part("loss", part)).eval(), config
+    return Tracker(config, fast=False).eval(), config
 
 
-def _owner(switch: str, part: Any, config: TrackerConfig) -> nn.Module:
-    if switch != "loss":
-        return Tracker(config, fast=False).eval()
-    return Holder(LossConfig(form=part) if isinstance(part, str) else make_part("loss", part)).eval()
+def _channels(owner: nn.Module) -> int:
+    return owner.time.shape[1] if isinstance(owner, Tracker) else 4
+
+
+def _examine(probe: Probe, switch: str, owner: nn.Module, given: Tensors, faults: dict[str, str]) -> None:
+    """Add the faults of a part, the first of each kind; outputs of wrong shapes are not looked at further."""
+    x = {name: given[name] for name in probe.inputs}
+    poor = {where: x | {k: v for k, v in some.items() if k in x} for where, some in poor_inputs(given).items()}
+    poor = {where: some for where, some in poor.items() if any(some[name] is not x[name] for name in x)}
+
+    def run(inputs: Tensors, training: bool = False) -> Tensors:
+        torch.manual_seed(0)  # and a copy, so that one call cannot help or harm the next
+        return probe.call(copy.deepcopy(owner).train(training), {name: value.clone() for name, value in inputs.items()})
+
+    with torch.no_grad():
+        out = run(x)
+        checks = [_formal(probe.shapes, owner, x, out)]
+        checks += [_finite(run, {"for ordinary inputs": x, **poor}), _repeated(probe, owner, x, out)]
+        checks += [_apart(probe, run, x), _device(probe, owner, x)]
+        for check in checks:
+            for kind, text in check:
+                faults.setdefault(kind, text)
+            if "shape" in faults or "type" in faults:
+                return
+        for text, value, wanted in probe.facts(copy.deepcopy(owner), x, out):
+            if not _same(value, wanted):
+                faults.setdefault("values", text)
+    for kind, text in _gradients(probe, copy.deepcopy(owner), switch, {"for ordinary inputs": x, **poor}):
+        faults.setdefault(kind, text)
+
+
+def _said(error: BaseException) -> str:
+    """An exception in one line."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, ValueError) else f"{type(error).__name__}: {text}"
+
+
+def _formal(shapes: Callable[..., dict], owner: nn.Module, x: Tensors, out: Tensors) -> Faults:
+    for name, value in out.items():
+        if not isinstance(value, Tensor):
+            yield "type", f"{name} is {type(value).__name__}, expected a tensor"
+            return
+    for name, shape in shapes(owner, x, out).items():
+        dtype = torch.int64 if name == "indices" else torch.float32
+        if tuple(out[name].shape) != shape:
+            yield "shape", f"{name} has shape {tuple(out[name].shape)}, expected {shape}"
+        elif out[name].dtype != dtype:
+            yield "dtype", f"{name} has dtype {out[name].dtype}, expected {dtype}"
+
+
+def _finite(run: Callable[..., Tensors], inputs: dict[str, Tensors]) -> Faults:
+    for where, x in inputs.items():
+        for name, value in run(x).items():
+            if not value.isfinite().all():
+                yield "finite", f"{name} has NaN or infinite values {where}, expected finite ones"
+
+
+def _repeated(probe: Probe, owner: nn.Module, x: Tensors, out: Tensors) -> Faults:
+    torch.manual_seed(1)
+    if not _same(probe.call(copy.deepcopy(owner), dict(x)), out):
+        yield "random", "two calls in evaluation mode give different results, expected the same"
+
+
+def _apart(probe: Probe, run: Callable[..., Tensors], x: Tensors) -> Faults:
+    other = {name: torch.cat([value[:1], _another(value[1:])]) for name, value in x.items()}
+    for mode in (False, True):  # in training too, where batch normalisation mixes clips
+        one, two = run(x, mode), run(other, mode)
+        if all(value.ndim for value in one.values()):
+            same = _same(*({name: value[0] for name, value in out.items()} for out in (one, two)))
+        else:  # a loss
+            alone = [run({name: value[i : i + 1] for name, value in x.items()}, mode) for i in (0, 1)]
+            same = _same(one, {name: (alone[0][name] + alone[1][name]) / 2 for name in one})
+        if not same:
+            yield "batch", "the result of one clip changes with the other clips of the batch, expected no influence"
+    if probe.tracks:
+        other = dict(x)
+        for name, axis in probe.tracks.items():
+            first, rest = x[name].split([1, x[name].shape[axis] - 1], axis)
+            other[name] = torch.cat([first, _another(rest)], axis)
+        if not _same(*({name: value[:, :, 0] for name, value in run(some).items()} for some in (x, other))):
+            yield "tracks", "the result of one track changes with the other tracks, expected no influence"
+    if probe.unseen is not None:
+        other, text = probe.unseen(x)
+        kept = ({n: v[:, :, :-1] if v.ndim > 2 else v for n, v in run(some).items()} for some in (x, other))
+        if not _same(*kept):  # of inactive tracks, the last ones, outputs may be anything
+            yield "unused", f"the result depends on values {text}; expected none"
+
+
+def _another(x: Tensor) -> Tensor:
+    """Other values of the same kind."""
+    return 1.1 * x + 0.01 * x.abs() if x.is_floating_point() else x.flip(-1)
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(_same(one[name], other[name]) for name in one)
+    close = {"rtol": 1e-3, "atol": 1e-4, "equal_nan": True}
+    return one.shape == other.shape and torch.allclose(one.double(), other.double(), **close)
+
+
+class _OneDevice(TorchDispatchMode):
+    """Raises where an operation takes tensors (not single numbers) from two devices, as a GPU would."""
+
+    def __torch_dispatch__(self, func: Callable, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        name, tensors = func.name(), [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor) and x.ndim]
+        copies = ("_to_copy", "copy_", "index.", "index_put_")
+        if len({x.device.type for x in tensors}) > 1 and not name.removeprefix("aten::").startswith(copies):
+            raise RuntimeError(f"two devices in {name}")
+        return func(*args, **(kwargs or {}))
+
+
+def _device(probe: Probe, owner: nn.Module, x: Tensors) -> Faults:
+    """Whether everything is made where the inputs are, seen on the device "meta", which has no values."""
+    advice = "expected the inputs' device: give device=x.device, or register a buffer"
+    try:
+        with _OneDevice():
+            out = probe.call(copy.deepcopy(owner).to("meta"), {name: value.to("meta") for name, value in x.items()})
+    except Exception as error:  # also where it looks at values, as it may
+        reason = _said(error)
+        if "two devices in" in reason:
+            yield "device", f"{reason.partition(': ')[2]}: tensors are made on the CPU, {advice}"
+        elif "numpy" in reason or "can't convert" in reason:
+            yield (
+                "device",
+                f"values are taken to the CPU ({reason}), expected operations of torch on the inputs' device",
+            )
+        return
+    if wrong := [name for name, value in out.items() if value.device.type != "meta"]:
+        yield "device", f"{wrong[0]} is on the CPU, {advice}"
+
+
+def _gradients(probe: Probe, owner: nn.Module, switch: str, inputs: dict[str, Tensors]) -> Faults:
+    part = getattr(owner, switch)
+    with torch.no_grad():
+        for parameter in part.parameters() if isinstance(part, nn.Module) else ():
+            parameter += 0.1 * torch.randn(parameter.shape)  # what begins as zero would hide what lies before it
+    for where, x in inputs.items():
+        given = {name: value.clone().requires_grad_(name in probe.learnt) for name, value in x.items()}
+        out = [value.flatten() for value in probe.call(owner, given).values() if value.requires_grad]
+        if not out:
+            yield "gradient", "the outputs carry no gradient at all; expected no detach, no_grad, or rounding"
+            return
+        total = sum((value * torch.linspace(0.5, 1.5, len(value))).sum() for value in out)
+        found = torch.autograd.grad(total, [given[name] for name in probe.learnt], allow_unused=True)
+        if any(one is not None and not one.isfinite().all() for one in found):
+            yield "finite", f"gradients are NaN or infinite {where}, expected finite ones"
+        if where != next(iter(inputs)):
+            continue
+        for name in (name for name, one in zip(probe.learnt, found, strict=True) if one is None or not one.any()):
+            moved = x | {name: x[name] + 0.1 * torch.randn(x[name].shape)}
+            with torch.no_grad():
+                if not _same(probe.call(owner, moved), probe.call(owner, x)):
+                    text = f"the outputs depend on {name}, but no gradient reaches it; expected no detach or no_grad"
+                    yield "gradient", text
