@@ -117,9 +117,7 @@ class Clip:
         if self.queries is not None:
             _set(self, "queries", check_queries(self, self.queries))
         if self.tracks is not None and len(self.tracks.xyz) != frames:
-            raise ValueError(
-                f"Clip.tracks: expected {frames} frames as in the video, got {len(self.tracks.xyz)}; cut both alike"
-            )
+            raise ValueError(f"Clip.tracks: expected {frames} frames as in the video, got {len(self.tracks.xyz)}")
         if not (isinstance(self.fps, Real) and np.isfinite(self.fps) and self.fps > 0):
             raise ValueError(f"Clip.fps: expected a positive number, got {self.fps!r}")
         if not isinstance(self.name, str):

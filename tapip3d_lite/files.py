@@ -128,9 +128,7 @@ def load_npz(
                     arrays[key] = _array(archive.read(member), dtype, shape, order, start) if zeros is None else zeros
             return arrays
     except (ValueError, TypeError, OSError, MemoryError, zlib.error) as error:
-        raise ValueError(
-            f"{path}: not a readable npz ({error}); it may be truncated, pickled or of another format"
-        ) from error
+        raise ValueError(f"{path}: not a readable npz ({error}); truncated, pickled or of another format?") from error
 
 
 def npz_keys(path: str | Path) -> set[str]:

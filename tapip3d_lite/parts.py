@@ -70,10 +70,8 @@ def allowed_parts(values: Mapping[str, Any], switches: Iterable[str], parts: Any
         ValueError: a part that is not allowed, and how to allow it.
     """
     named = {name: values[name] for name in switches if isinstance(values.get(name), str) and ":" in values[name]}
-    return {
-        name: _allowed(name, value, parts if isinstance(parts, list | tuple) else [parts])
-        for name, value in named.items()
-    }
+    parts = parts if isinstance(parts, list | tuple) else [parts]
+    return {name: _allowed(name, value, parts) for name, value in named.items()}
 
 
 def _allowed(what: str, name: str, parts: Iterable[Any]) -> Any:

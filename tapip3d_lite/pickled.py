@@ -45,7 +45,7 @@ class Refused(ValueError):
 class Machine:
     """Carries out a pickle's instructions on a stack; what it reads are containers, numbers, text and `Record`s.
 
-    Sets are lists; types and functions are `Name`s. X
+    Sets are lists; types and functions are `Name`s.
     """
 
     recorded: Collection[str] = ()

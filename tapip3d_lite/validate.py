@@ -53,9 +53,7 @@ def check_extras(extras: Mapping[str, np.ndarray], taken: Collection[str]) -> No
     """Raise ValueError unless a clip's further arrays have names and values that its file can hold."""
     for key, value in extras.items():
         if not isinstance(key, str) or not key.isprintable() or key in {*taken, "", "file", "allow_pickle"}:
-            raise ValueError(
-                f"Clip.extras: expected text that is no key of a clip's file as a name, got {key!r}; rename it"
-            )
+            raise ValueError(f"Clip.extras: expected text that is no key of a clip's file, got {key!r}; rename it")
         if (dtype := np.asarray(value).dtype).kind not in "biufcSUmM" or not dtype.itemsize:
             raise ValueError(f"Clip.extras: {key!r}: expected numbers or text, got dtype {dtype}; convert or drop it")
 
@@ -123,11 +121,14 @@ def check_types(config: object) -> None:
 
 def _fits(kind: str, value: object) -> bool:
     switch = isinstance(value, _KINDS["bool"])
-    return (
-        isinstance(value, _KINDS[kind])
-        and switch == (kind == "bool")
-        and (kind in ("bool", "str") or abs(value) < 1e300)
-    )
+    fits = isinstance(value, _KINDS[kind]) and switch == (kind == "bool")
+    return fits and (kind in ("bool", "str") or abs(value) < 1e300)
+
+
+def changed(old: Mapping[str, object], new: Mapping[str, object]) -> str:
+    """Each value that differs, as `name=old (now new)`; empty where none does."""
+    names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    return ", ".join(f"{name}={old.get(name)!r} (now {new.get(name)!r})" for name in names)
 
 
 def check_state(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
@@ -136,16 +137,14 @@ def check_state(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
     if missing or unknown:
         named = (", ".join(names[:9]) + ", …" * (len(names) > 9) or "none" for names in (missing, unknown))
         raise ValueError(
-            "parameters do not fit the config: missing parameters: {}; unknown parameters: {}".format(*named)
+            "parameters do not fit the config: missing parameters: {}, unknown parameters: {}".format(*named)
         )
     for name, value in state.items():
         if value.shape != wanted[name].shape:
             shapes = f"expected shape {tuple(wanted[name].shape)}, got {tuple(value.shape)}"
             raise ValueError(f"parameters do not fit the config: {name}: {shapes}")
         if not value.float().isfinite().all():
-            raise ValueError(
-                f"parameter {name} is not finite: its training failed, or the file is damaged; use another one"
-            )
+            raise ValueError(f"parameter {name} is not finite: its training failed, or the file is damaged")
 
 
 def check_names(where: str, given: Iterable[str], known: Collection[str]) -> None:

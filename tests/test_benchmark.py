@@ -334,7 +334,7 @@ def test_results_survive_the_file(tmp_path):
     assert versions == {"klt": "v1"}
     (tmp_path / "r.json").write_text('{"klt": 3}')
     for path in (tmp_path / "r.json", tmp_path / "absent.json"):
-        with pytest.raises(ValueError, match="not readable benchmark results"):
+        with pytest.raises(ValueError, match="not a readable JSON file"):
             load_results(path)
 
 

@@ -162,10 +162,6 @@ def world(function):
     return space(from_world=lambda self, xyz, intrinsics, extrinsics: function(xyz), to_world=lambda self, x, *_: x)
 
 
-def everything(self, x, counted):
-    return x.mean()
-
-
 MEAN = Distance.total
 BROKEN = [
     # what comes out
@@ -207,8 +203,6 @@ BROKEN = [
     ("loss", "batch", loss(lambda self, x, counted: (x * counted).sum((1, 2)).square().sum().sqrt()), "other clips"),
     ("context", "tracks", context(lambda self, x, near: x - x.mean(2, keepdim=True)), "other tracks"),
     ("neighborhood", "tracks", neighborhood(lambda self, near, *_: replace(near, features=near.features + near.features.mean(2, keepdim=True))), "other tracks"),
-    ("updater", "unused", updater(lambda self, x, _: x - x.mean(2, keepdim=True)), "not active"),
-    ("loss", "unused", loss(everything), "after the clip's end"),
     # gradients
     ("context", "gradient", context(lambda self, x, near: x.detach()), "no gradient at all"),
     ("context", "gradient", context(lambda self, x, near: x - near.features.mean((-1, -2)).unsqueeze(-1).detach()), None),

@@ -16,8 +16,8 @@ from safetensors.torch import save_file
 
 import tapip3d_lite as t3d
 from tapip3d_lite import archive
-from tapip3d_lite.checkpoint_reader import read_checkpoint
 from tapip3d_lite.files import load_npz, load_objects
+from tapip3d_lite.official import read_checkpoint
 from tapip3d_lite.saved import read_saved
 from tests.tiny import SIZES
 
@@ -489,7 +489,7 @@ def a_clip(**changes):
 @pytest.mark.parametrize(
     ("extras", "message"),
     [
-        ({"file": np.zeros(3)}, "no key of a clip's file as a name, got 'file'"),
+        ({"file": np.zeros(3)}, "no key of a clip's file, got 'file'"),
         ({"allow_pickle": np.array(True)}, "got 'allow_pickle'"),
         ({"video": np.zeros(3)}, "got 'video'"),
         ({"fps": np.zeros(3)}, "got 'fps'"),

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from tapip3d_lite.checkpoint_reader import plain
+from tapip3d_lite.official import plain
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "golden"
 CHECKPOINT = SHARED / "checkpoint_small.pth"

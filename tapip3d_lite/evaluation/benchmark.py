@@ -5,7 +5,6 @@ Results are nested dictionaries, `results[label][split][clip][metric]`, which JS
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,7 +16,7 @@ from tapip3d_lite.evaluation.baselines import TrackerLike
 from tapip3d_lite.evaluation.evaluate import evaluate, markdown_table
 from tapip3d_lite.evaluation.intervals import Estimate, bootstrap_interval, paired_difference
 from tapip3d_lite.evaluation.lite_splits import ALL, COUNT, SPLITS, benchmark_clips, check_split, split_file
-from tapip3d_lite.files import write_text
+from tapip3d_lite.files import digest, read_json, write_text
 from tapip3d_lite.parts import source
 
 Results = dict[str, dict[str, dict[str, dict[str, float]]]]  # label → split → clip → metric → score
@@ -70,16 +69,11 @@ def run_benchmark(
 
 def version_of(tracker: object, options: Mapping[str, object]) -> str:
     """A short digest of all that scores depend on: the benchmark's clips, a tracker's settings, code, weights, options."""
-    digest = hashlib.sha256()
-    for split in ALL:
-        digest.update(split_file(split).read_bytes())
-    digest.update(f"{getattr(tracker, 'config', tracker)!r} {sorted(options.items())}".encode())
-    for part in getattr(getattr(tracker, "config", None), "custom", ()):
-        digest.update(source(part).encode())
-    if hasattr(tracker, "state_dict"):
-        for name, weights in tracker.state_dict().items():
-            digest.update(name.encode() + weights.cpu().float().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:12]
+    config, state = getattr(tracker, "config", tracker), tracker.state_dict() if hasattr(tracker, "state_dict") else {}
+    seen = [*(split_file(split).read_bytes() for split in ALL), f"{config!r} {sorted(options.items())}"]
+    seen += [source(part) for part in getattr(config, "custom", ())]
+    weights = (name.encode() + x.cpu().float().contiguous().numpy().tobytes() for name, x in state.items())
+    return digest(*seen, *weights)
 
 
 def save_results(path: str | Path, results: Results, versions: Mapping[str, str | None] | None = None) -> None:
@@ -93,12 +87,9 @@ def save_results(path: str | Path, results: Results, versions: Mapping[str, str 
 
 def load_results(path: str | Path) -> tuple[Results, dict[str, str | None]]:
     """Read what `save_results` wrote: results, and the digest of each label; else ValueError."""
-    try:
-        rows = json.loads(Path(path).read_text(encoding="utf-8"))
-        results = {x: _map(row["scores"], lambda v: math.nan if v is None else v) for x, row in rows.items()}
-        return results, {x: row["version"] for x, row in rows.items()}
-    except (OSError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not readable benchmark results ({error}); delete it or name another file") from error
+    rows = read_json(path, lambda x: {k: (row["scores"] | {}, row["version"]) for k, row in x.items()})
+    results = {x: _map(scores, lambda v: math.nan if v is None else v) for x, (scores, _) in rows.items()}
+    return results, {x: version for x, (_, version) in rows.items()}
 
 
 def _map(scores: dict, change: Callable) -> dict:

@@ -9,7 +9,6 @@ fingerprint reveals a change of the renderer that would silently change the scor
 
 from __future__ import annotations
 
-import hashlib
 import os
 import tempfile
 from dataclasses import replace
@@ -20,6 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.files import digest
 from tapip3d_lite.formats import load_clip
 from tapip3d_lite.simulate import Rollout, render_clip
 from tapip3d_lite.simulate.dataset import run_jobs
@@ -122,9 +122,7 @@ def _cache() -> Path:
 def _key(path: Path) -> str:
     """A digest of everything that cached clips depend on: rollouts, the renderer's source, versions of its packages."""
     sources = sorted((Path(__file__).parents[1] / "simulate").glob("*.py"))
-    digest = hashlib.sha256(b"".join(file.read_bytes() for file in (path, *sources)))
-    digest.update(f"{version('mujoco')} {version('numpy')}".encode())
-    return digest.hexdigest()[:12]
+    return digest(*(file.read_bytes() for file in (path, *sources)), f"{version('mujoco')} {version('numpy')}")
 
 
 def _cached(job: Job) -> Clip | None:

@@ -53,9 +53,7 @@ def tapvid3d_metrics(
     if focal.shape[-2:] != (3, 3) or focal.ndim not in (2, 3) or (focal.ndim == 3 and len(focal) != len(p)):
         raise ValueError(f"intrinsics: expected ({len(p)}, 3, 3) or (3, 3), got {focal.shape}")
     if not (focal[..., [0, 1], [0, 1]] > 0).all():
-        raise ValueError(
-            "intrinsics: expected positive fx and fy (pixels) in K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
-        )
+        raise ValueError("intrinsics: expected positive fx, fy (pixels) in K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     scale = scale_factor(p, q, v & w, _query_frames(queries, p.shape[:2]), scaling)
     pixel = p[..., 2] / np.sqrt(focal[..., 0, 0] * focal[..., 1, 1])[..., None]
     with np.errstate(invalid="ignore", over="ignore"):

@@ -36,7 +36,7 @@ def check_drawable(clip: Clip, tracks: Tracks | None = None, frame: int = 0) -> 
         raise ValueError(f"frame: expected 0 to {len(clip) - 1} (clip {clip.name!r}), got {frame}; choose another")
     if tracks is not None and len(tracks.xyz) != len(clip):
         raise ValueError(
-            f"tracks: expected {len(clip)} frames as in clip {clip.name!r}, got {len(tracks.xyz)}; cut both alike"
+            f"tracks: expected {len(clip)} frames as in {clip.name!r}, got {len(tracks.xyz)}; cut both alike"
         )
 
 

@@ -54,9 +54,7 @@ def load_clip(
         raise ValueError(f"{path}: no such file; check the path")
     kind = _recognised(path) if format == "auto" else format
     if (kind in _FOLDERS) != path.is_dir() and path.suffix.lower() not in VIDEOS:
-        raise ValueError(
-            f"{path}: format {kind} is that of a {'folder' if kind in _FOLDERS else 'file'}; give it, or another"
-        )
+        raise ValueError(f"{path}: format {kind} is that of a {'folder' if kind in _FOLDERS else 'file'}; give one")
     try:
         if kind in _FOLDERS:
             find = partial(plain_folder, needs_depth=depth is None) if kind == "folder" else _FOLDERS[kind]
@@ -64,9 +62,7 @@ def load_clip(
             parts.tracks = parts.tracks if points else None
             return load_parts(parts, frames, path.resolve().stem, own)
         if frames != slice(None):
-            raise ValueError(
-                "frames are chosen in folders and videos; cut this clip after loading: clip.cut(start, stop)"
-            )
+            raise ValueError("frames are chosen in folders and videos; cut this clip afterwards: clip.cut(start, stop)")
         if kind == "tapvid3d":
             return tapvid3d(path, points, depth)
         clip = _FILES[kind](path, points)

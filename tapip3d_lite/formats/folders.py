@@ -119,14 +119,11 @@ def load_parts(parts: Parts, frames: slice, name: str, depths: np.ndarray | None
         depths = np.stack([fit_depth(z, size, f"{parts.folder}: the given depth") for z in depths[frames]])
     extrinsics = shift @ extrinsics
     tracks = parts.tracks(frames, intrinsics, extrinsics, size) if parts.tracks else None
-    return Clip(
-        video, depths, intrinsics, extrinsics, tracks=tracks, name=name, fps=float(fps if 0 < fps < np.inf else s.fps)
-    )
+    fps = float(fps if 0 < fps < np.inf else s.fps)
+    return Clip(video, depths, intrinsics, extrinsics, tracks=tracks, name=name, fps=fps)
 
 
-def _depths(
-    parts: Parts, frames: slice, intrinsics: np.ndarray, shift: np.ndarray, size: tuple[int, int]
-) -> np.ndarray:
+def _depths(parts: Parts, frames: slice, intrinsics: np.ndarray, shift: np.ndarray, size: tuple) -> np.ndarray:
     """The layout's own depth as z (T, H, W) of the colour camera."""
     s, depths = parts.settings, []
     for path, k in zip(parts.depth[frames], intrinsics, strict=True):
@@ -209,9 +206,7 @@ def read_poses(path: Path) -> np.ndarray:
         rows = list(np.reshape(rows, (-1, 16)))
     lengths = {len(row) for row in rows}
     if len(lengths) != 1 or not lengths <= {7, 8, 12, 16}:
-        raise ValueError(
-            f"{path}: expected 16, 12, 8 or 7 (tx ty tz qx qy qz qw) numbers a pose, got {sorted(lengths)}"
-        )
+        raise ValueError(f"{path}: expected 16, 12, 8 or 7 (tx ty tz qx qy qz qw) a pose, got {sorted(lengths)}")
     numbers = np.stack(rows)
     if lengths <= {7, 8}:
         return rigid(numbers[:, -7:-4], numbers[:, -4:])

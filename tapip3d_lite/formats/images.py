@@ -1,15 +1,9 @@
-"""Frames from files: colour images, depth images (PNG, TIFF, EXR, npy), videos; depth of another size or camera.
-
-OpenCV's wheels without a display (opencv-python-headless 5) are built without OpenEXR, whatever
-OPENCV_IO_ENABLE_OPENEXR says, so EXR is read here: scan lines, uncompressed or ZIP, the first channel.
-"""
+"""Frames from files: colour images, depth images (PNG, TIFF, EXR, npy), videos; depth of another size or camera."""
 
 from __future__ import annotations
 
 import math
-import struct
-import zlib
-from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -28,9 +22,7 @@ def decode_color(data: bytes, name: object) -> np.ndarray:
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if image is None:
-        raise ValueError(
-            f"{name}: not a readable image; it may be truncated or of an unknown kind: save it as PNG or JPEG"
-        )
+        raise ValueError(f"{name}: not a readable image; truncated, or of an unknown kind; save it as PNG or JPEG")
     return np.ascontiguousarray(image[..., ::-1])
 
 
@@ -62,17 +54,13 @@ def read_depth(path: Path, scale: float = 1000.0, no_depth: float = 65535) -> np
     Raises:
         ValueError: unreadable, 8-bit, or of several channels that differ.
     """
-    data = path.read_bytes()
-    if path.suffix.lower() == ".exr":
-        depth = decode_exr(data, path)
-    elif path.suffix.lower() == ".npy":
-        depth = map_npy(path)
+    if path.suffix.lower() in (".exr", ".npy"):
+        depth = _exr(path) if path.suffix.lower() == ".exr" else map_npy(path)
     else:
-        depth = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        depth = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if depth is None:
-        raise ValueError(
-            f"{path}: not a readable depth image; write 16-bit PNG (millimetres), TIFF, EXR or npy (metres)"
-        )
+        raise ValueError(f"{path}: not a readable depth image; write 16-bit PNG (mm), TIFF, EXR or npy (metres)")
     depth = depth[..., 0] if depth.ndim == 3 and (depth == depth[..., :1]).all() else depth
     if depth.dtype.itemsize == 1 or depth.ndim != 2:
         raise ValueError(
@@ -124,56 +112,12 @@ def register_depth(
     return registered
 
 
-def decode_exr(data: bytes, name: object) -> np.ndarray:
-    """The first channel (H, W) of an OpenEXR file's bytes, as float32.
-
-    Raises:
-        ValueError: not an EXR file, truncated, tiled, or compressed by another method than ZIP.
-    """
+def _exr(path: Path) -> np.ndarray:
+    """The first channel (H, W) of an EXR file, which OpenCV's wheels without a display cannot read."""
     try:
-        if data[:4] != b"\x76\x2f\x31\x01" or data[5] & 0x1A:
-            raise ValueError("not a plain EXR file of scan lines")
-        header, at = {}, 8
-        while data[at]:
-            key, kind = data.index(0, at), data.index(0, data.index(0, at) + 1)
-            (length,) = struct.unpack_from("<i", data, kind + 1)
-            header[data[at:key]] = data[kind + 5 : kind + 5 + length]
-            at = kind + 5 + length
-        left, top, right, bottom = struct.unpack("<4i", header[b"dataWindow"])
-        types = [np.dtype(("<u4", "<f2", "<f4")[kind]) for kind in _channels(header[b"channels"])]
-        method = header[b"compression"][0]
-        if method not in (0, 2, 3):
-            raise ValueError(f"compression {method} is not read, only none and ZIP")
-        width, height, rows = right - left + 1, bottom - top + 1, 16 if method == 3 else 1
-        line = width * sum(kind.itemsize for kind in types)
-        image = np.zeros((height, width), np.float32)
-        for (start,) in struct.iter_unpack("<Q", data[at + 1 : at + 1 + 8 * math.ceil(height / rows)]):
-            y, length = struct.unpack_from("<2i", data, start)
-            count = min(rows, bottom + 1 - y)
-            block = data[start + 8 : start + 8 + length]
-            block = _unzipped(block) if method and length < count * line else block
-            table = np.frombuffer(block, np.uint8).reshape(count, line)[:, : width * types[0].itemsize]
-            image[y - top : y - top + count] = np.ascontiguousarray(table).view(types[0])
-    except (ValueError, KeyError, IndexError, struct.error, zlib.error) as error:
-        raise ValueError(
-            f"{name}: not a readable depth image ({error}); write it as TIFF, npy or EXR with ZIP"
-        ) from None
-    return image
-
-
-def _channels(data: bytes) -> Iterator[int]:
-    at = 0
-    while data[at]:
-        at = data.index(0, at) + 1
-        yield struct.unpack_from("<i", data, at)[0]
-        at += 16
-
-
-def _unzipped(block: bytes) -> bytes:
-    """EXR's ZIP: differences of neighbouring bytes, even bytes before odd ones."""
-    values = np.frombuffer(zlib.decompress(block), np.uint8).astype(np.int64)
-    values[1:] -= 128
-    values = np.cumsum(values).astype(np.uint8)
-    mixed, half = np.empty_like(values), (len(values) + 1) // 2
-    mixed[::2], mixed[1::2] = values[:half], values[half:]
-    return mixed.tobytes()
+        with import_module("OpenEXR").File(str(path), separate_channels=True) as file:
+            return next(iter(file.channels().values())).pixels.astype(np.float32)
+    except ImportError:
+        raise ValueError(f"{path}: EXR needs `pip install OpenEXR`; or write it as TIFF or npy (metres)") from None
+    except Exception as error:  # a damaged file fails in any way
+        raise ValueError(f"{path}: not a readable EXR ({error}); write it as TIFF or npy (metres)") from None

@@ -47,16 +47,13 @@ def model_card(
     config = TrainConfig.read(folder / "config.json", parts)
     log, (scores, _) = read_log(folder), load_results(results)
     if not log or not scores:
-        raise ValueError(
-            f"card: expected steps in {folder / 'log.jsonl'} and scores in {results}; one of them is empty"
-        )
+        raise ValueError(f"card: expected steps in {folder / 'log.jsonl'} and scores in {results}; one is empty")
     compared = [label for label in scores if any(split in scores[label] for split in ALL)]
     trackers = " ".join(dict.fromkeys(label.rpartition(" · ")[0] or label for label in compared))  # not once a space
     splits = [split for split in ALL if any(split in scores[label] for label in compared)]
     chosen = f" --split {' '.join(splits)}" if set(splits) - set(SPLITS) else ""
-    scoring = (
-        f"python -m tapip3d_lite benchmark --tracker {trackers}{chosen} --space world camera --out {Path(results).name}"
-    )
+    scoring = f"python -m tapip3d_lite benchmark --tracker {trackers}{chosen} --space world camera"
+    scoring = f"{scoring} --out {Path(results).name}"
     parts = [
         f"# Model card: `{name}`",
         _facts(config, log, path, hardware, parts),

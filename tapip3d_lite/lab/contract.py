@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from tapip3d_lite.lab.probes import PROBES, Holder, Probe, Tensors, poor_inputs, random_inputs
+from tapip3d_lite.lab.probes import PROBES, Outputs, Probe, Tensors, poor_inputs, random_inputs
 from tapip3d_lite.model.config import SWITCHES, TrackerConfig
 from tapip3d_lite.model.n2n import Context
 from tapip3d_lite.model.registry import PARTS
@@ -72,7 +72,7 @@ class PartReport:
     __repr__ = __str__
 
 
-def check_part(part: Any, switch: str | None = None, config: TrackerConfig | None = None, seed: int = 0) -> PartReport:
+def check_part(part: Any, switch: str | None = None, config: TrackerConfig | None = None) -> PartReport:
     """Try a part with tiny random inputs, before any training; it raises nothing, whatever the part does.
 
     Args:
@@ -80,7 +80,6 @@ def check_part(part: Any, switch: str | None = None, config: TrackerConfig | Non
         switch: `"space"`, `"neighborhood"`, `"context"`, `"updater"` or `"loss"`; None: guessed from the part's base
             class or the names of its arguments.
         config: sizes and the other switches; None: tiny ones, all different.
-        seed: of the inputs.
 
     Example:
         >>> from tapip3d_lite import lab
@@ -97,9 +96,9 @@ def check_part(part: Any, switch: str | None = None, config: TrackerConfig | Non
             report.faults["switch"] = f"it is not clear what this is for; {wanted}"
             return report
         with torch.random.fork_rng(devices=[]), torch.inference_mode(False), torch.enable_grad():
-            torch.manual_seed(seed)
-            owner, config = _owner(report.switch, part, config)
-            given = random_inputs(config, torch.Generator().manual_seed(seed), _channels(owner))
+            torch.manual_seed(0)
+            owner = _owner(report.switch, part, config)
+            given = random_inputs(owner.config, torch.Generator().manual_seed(0), owner.time.shape[1])
             _examine(PROBES[report.switch], report.switch, owner, given, report.faults)
     except Exception as error:  # the part's own code may raise anything
         made = "owner" in locals()
@@ -125,44 +124,44 @@ def _guess(part: Any) -> str | None:
     return next((switch for switch, names in _ARGUMENTS.items() if names <= given), None)
 
 
-def _owner(switch: str, part: Any, config: TrackerConfig | None) -> tuple[nn.Module, TrackerConfig]:
-    """What has the part, in evaluation mode, and the sizes of its inputs."""
+def _owner(switch: str, part: Any, config: TrackerConfig | None) -> Tracker:
+    """A tracker in evaluation mode that has the part, also a loss, which then moves with it."""
     companions = _COMPANIONS.get((switch, part), {}) if isinstance(part, str) else {}
     own = {} if switch == "loss" else {switch: part}
     config = TrackerConfig(**(_TINY | companions | own)) if config is None else config.replace(**own)
+    owner = Tracker(config, fast=False)
     if switch == "loss":
-        return Holder(LossConfig(form=part) if isinstance(part, str) else make_part("loss", part)).eval(), config
-    return Tracker(config, fast=False).eval(), config
+        owner.loss = LossConfig(form=part) if isinstance(part, str) else make_part("loss", part)
+    return owner.eval()
 
 
-def _channels(owner: nn.Module) -> int:
-    return owner.time.shape[1] if isinstance(owner, Tracker) else 4
-
-
-def _examine(probe: Probe, switch: str, owner: nn.Module, given: Tensors, faults: dict[str, str]) -> None:
+def _examine(probe: Probe, switch: str, owner: Tracker, given: Tensors, faults: dict[str, str]) -> None:
     """Add the faults of a part, the first of each kind; outputs of wrong shapes are not looked at further."""
     x = {name: given[name] for name in probe.inputs}
     poor = {where: x | {k: v for k, v in some.items() if k in x} for where, some in poor_inputs(given).items()}
     poor = {where: some for where, some in poor.items() if any(some[name] is not x[name] for name in x)}
 
-    def run(inputs: Tensors, training: bool = False) -> Tensors:
-        torch.manual_seed(0)  # and a copy, so that one call cannot help or harm the next
+    def called(inputs: Tensors, training: bool = False, seed: int = 0) -> Outputs:
+        torch.manual_seed(seed)  # and a copy, so that one call cannot help or harm the next
         return probe.call(copy.deepcopy(owner).train(training), {name: value.clone() for name, value in inputs.items()})
 
+    def run(*options: Any) -> Tensors:
+        return {name: value for name, (value, _) in called(*options).items()}
+
+    inputs = {"for ordinary inputs": x, **poor}
     with torch.no_grad():
         out = run(x)
-        checks = [_formal(probe.shapes, owner, x, out)]
-        checks += [_finite(run, {"for ordinary inputs": x, **poor}), _repeated(probe, owner, x, out)]
-        checks += [_apart(probe, run, x), _device(probe, owner, x)]
-        for check in checks:
+        for check in (_formal(called(x)), _finite(run, inputs), _apart(probe, run, x), _device(probe, owner, x)):
             for kind, text in check:
                 faults.setdefault(kind, text)
             if "shape" in faults or "type" in faults:
                 return
+        if not _same(run(x, False, 1), out):
+            faults["random"] = "two calls in evaluation mode give different results, expected the same"
         for text, value, wanted in probe.facts(copy.deepcopy(owner), x, out):
             if not _same(value, wanted):
                 faults.setdefault("values", text)
-    for kind, text in _gradients(probe, copy.deepcopy(owner), switch, {"for ordinary inputs": x, **poor}):
+    for kind, text in _gradients(probe, copy.deepcopy(owner), switch, inputs):
         faults.setdefault(kind, text)
 
 
@@ -172,17 +171,15 @@ def _said(error: BaseException) -> str:
     return text if isinstance(error, ValueError) else f"{type(error).__name__}: {text}"
 
 
-def _formal(shapes: Callable[..., dict], owner: nn.Module, x: Tensors, out: Tensors) -> Faults:
-    for name, value in out.items():
+def _formal(out: Outputs) -> Faults:
+    for name, (value, shape) in out.items():
+        dtype = torch.int64 if name == "indices" else torch.float32
         if not isinstance(value, Tensor):
             yield "type", f"{name} is {type(value).__name__}, expected a tensor"
-            return
-    for name, shape in shapes(owner, x, out).items():
-        dtype = torch.int64 if name == "indices" else torch.float32
-        if tuple(out[name].shape) != shape:
-            yield "shape", f"{name} has shape {tuple(out[name].shape)}, expected {shape}"
-        elif out[name].dtype != dtype:
-            yield "dtype", f"{name} has dtype {out[name].dtype}, expected {dtype}"
+        elif value.shape != shape:
+            yield "shape", f"{name} has shape {tuple(value.shape)}, expected {tuple(shape)}"
+        elif value.dtype != dtype:
+            yield "dtype", f"{name} has dtype {value.dtype}, expected {dtype}"
 
 
 def _finite(run: Callable[..., Tensors], inputs: dict[str, Tensors]) -> Faults:
@@ -190,12 +187,6 @@ def _finite(run: Callable[..., Tensors], inputs: dict[str, Tensors]) -> Faults:
         for name, value in run(x).items():
             if not value.isfinite().all():
                 yield "finite", f"{name} has NaN or infinite values {where}, expected finite ones"
-
-
-def _repeated(probe: Probe, owner: nn.Module, x: Tensors, out: Tensors) -> Faults:
-    torch.manual_seed(1)
-    if not _same(probe.call(copy.deepcopy(owner), dict(x)), out):
-        yield "random", "two calls in evaluation mode give different results, expected the same"
 
 
 def _apart(probe: Probe, run: Callable[..., Tensors], x: Tensors) -> Faults:
@@ -216,11 +207,6 @@ def _apart(probe: Probe, run: Callable[..., Tensors], x: Tensors) -> Faults:
             other[name] = torch.cat([first, _another(rest)], axis)
         if not _same(*({name: value[:, :, 0] for name, value in run(some).items()} for some in (x, other))):
             yield "tracks", "the result of one track changes with the other tracks, expected no influence"
-    if probe.unseen is not None:
-        other, text = probe.unseen(x)
-        kept = ({n: v[:, :, :-1] if v.ndim > 2 else v for n, v in run(some).items()} for some in (x, other))
-        if not _same(*kept):  # of inactive tracks, the last ones, outputs may be anything
-            yield "unused", f"the result depends on values {text}; expected none"
 
 
 def _another(x: Tensor) -> Tensor:
@@ -246,7 +232,7 @@ class _OneDevice(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def _device(probe: Probe, owner: nn.Module, x: Tensors) -> Faults:
+def _device(probe: Probe, owner: Tracker, x: Tensors) -> Faults:
     """Whether everything is made where the inputs are, seen on the device "meta", which has no values."""
     advice = "expected the inputs' device: give device=x.device, or register a buffer"
     try:
@@ -257,23 +243,20 @@ def _device(probe: Probe, owner: nn.Module, x: Tensors) -> Faults:
         if "two devices in" in reason:
             yield "device", f"{reason.partition(': ')[2]}: tensors are made on the CPU, {advice}"
         elif "numpy" in reason or "can't convert" in reason:
-            yield (
-                "device",
-                f"values are taken to the CPU ({reason}), expected operations of torch on the inputs' device",
-            )
+            yield "device", f"values are taken to the CPU ({reason}), expected torch's operations on the inputs' device"
         return
-    if wrong := [name for name, value in out.items() if value.device.type != "meta"]:
+    if wrong := [name for name, (value, _) in out.items() if value.device.type != "meta"]:
         yield "device", f"{wrong[0]} is on the CPU, {advice}"
 
 
-def _gradients(probe: Probe, owner: nn.Module, switch: str, inputs: dict[str, Tensors]) -> Faults:
+def _gradients(probe: Probe, owner: Tracker, switch: str, inputs: dict[str, Tensors]) -> Faults:
     part = getattr(owner, switch)
     with torch.no_grad():
         for parameter in part.parameters() if isinstance(part, nn.Module) else ():
             parameter += 0.1 * torch.randn(parameter.shape)  # what begins as zero would hide what lies before it
     for where, x in inputs.items():
         given = {name: value.clone().requires_grad_(name in probe.learnt) for name, value in x.items()}
-        out = [value.flatten() for value in probe.call(owner, given).values() if value.requires_grad]
+        out = [value.flatten() for value, _ in probe.call(owner, given).values() if value.requires_grad]
         if not out:
             yield "gradient", "the outputs carry no gradient at all; expected no detach, no_grad, or rounding"
             return
@@ -286,6 +269,7 @@ def _gradients(probe: Probe, owner: nn.Module, switch: str, inputs: dict[str, Te
         for name in (name for name, one in zip(probe.learnt, found, strict=True) if one is None or not one.any()):
             moved = x | {name: x[name] + 0.1 * torch.randn(x[name].shape)}
             with torch.no_grad():
-                if not _same(probe.call(owner, moved), probe.call(owner, x)):
+                both = [torch.cat([value.flatten() for value, _ in probe.call(owner, y).values()]) for y in (moved, x)]
+                if not _same(*both):
                     text = f"the outputs depend on {name}, but no gradient reaches it; expected no detach or no_grad"
                     yield "gradient", text

@@ -33,9 +33,7 @@ def open_study(source: str | Path, accept_code: bool = False, parts: Sequence[An
     if (path / "study.json").exists():
         return Study(path, accept_code=accept_code, parts=parts), None
     if path.suffix not in (".toml", ".json"):
-        check_names(
-            "lab: neither a file (.toml, .json), nor a study's folder, nor a table of the paper", [str(source)], TABLES
-        )
+        check_names("lab: no file (.toml, .json), no study's folder, no table of the paper", [str(source)], TABLES)
         values, home = TABLES[str(source)], Path()
         values = {"store": "runs/store", **values}
     else:

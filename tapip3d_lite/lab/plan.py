@@ -70,9 +70,7 @@ class Plan:
         ours, rows = self.to_dict(), [name for name in self.rows if name in old["rows"]]
         if found := diff(*({"budget": x["budget"], "rows": {n: x["rows"][n] for n in rows}} for x in (old, ours))):
             text = ", ".join(f"{name}={a!r} (now {b!r})" for name, (a, b) in found.items())
-            raise ValueError(
-                f"Study: {self.folder} was made otherwise: {text}; use its values, or other names or folders"
-            )
+            raise ValueError(f"Study: {self.folder} was made otherwise: {text}; use its values, other names or folders")
         changed = diff(old["code"], self.code)
         if changed and not accept_code:
             raise ValueError(

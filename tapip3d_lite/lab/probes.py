@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from tapip3d_lite.geometry import pixel_grid, project
 from tapip3d_lite.model.cloud import Level
@@ -20,16 +19,9 @@ from tapip3d_lite.model.windows import Scene, Step
 from tapip3d_lite.training.loss import Truth
 
 Tensors = dict[str, Tensor]
+Outputs = dict[str, tuple[Tensor, tuple[int, ...]]]
 _BATCH, _TRACKS = 2, 3
 _CAMERAS, _LEVEL = ("depths", "intrinsics", "extrinsics"), ("features", "points", "valid", "coords", "cells")
-
-
-class Holder(nn.Module):
-    """A loss as part of a module, so that it moves like a tracker's parts."""
-
-    def __init__(self, loss: Any) -> None:
-        super().__init__()
-        self.loss = loss
 
 
 class _WorldStep(Step):
@@ -46,23 +38,19 @@ class Probe:
         contract: how they are called, in words.
         made: how a class is called.
         inputs: names of those of `random_inputs` that they are given.
-        call: from an owner (a tracker, or a `Holder`) and inputs to outputs, by name.
-        shapes: from owner, inputs and outputs to the shape that each output should have.
+        call: from a tracker that has the part, and inputs, to outputs by name, each with the shape that it should have.
         learnt: inputs whose gradients must not stop.
         tracks: axis of the tracks in those inputs that belong to tracks, where no track may depend on others.
-        unseen: from inputs to the same with other values where a part may not look, and why.
-        facts: from owner, inputs and outputs to (what, value, wanted value) that must be equal.
+        facts: from tracker, inputs and outputs to (what, value, wanted value) that must be equal.
     """
 
     contract: str
     made: str
     inputs: tuple[str, ...]
-    call: Callable[[Any, Tensors], Tensors]
-    shapes: Callable[[Any, Tensors, Tensors], dict[str, tuple[int, ...]]]
+    call: Callable[[Tracker, Tensors], Outputs]
     learnt: tuple[str, ...]
     tracks: dict[str, int] = field(default_factory=dict)
-    unseen: Callable[[Tensors], tuple[Tensors, str]] | None = None
-    facts: Callable[[Any, Tensors, Tensors], list[tuple[str, Tensor, Tensor]]] = lambda *_: []
+    facts: Callable[[Tracker, Tensors, Tensors], list[tuple[str, Tensor, Tensor]]] = lambda *_: []
 
 
 def random_inputs(config: TrackerConfig, g: torch.Generator, channels: int) -> Tensors:
@@ -119,22 +107,17 @@ def poor_inputs(x: Tensors) -> dict[str, Tensors]:
     }
 
 
-def _space(owner: Tracker, x: Tensors) -> Tensors:
+def _space(owner: Tracker, x: Tensors) -> Outputs:
     space, cameras = fitted(owner.space, _frames(x)), (x["intrinsics"], x["extrinsics"])
     coords, own = space.from_world(x["xyz"], *cameras), [c[:, :1].expand(-1, _TRACKS, -1, -1) for c in cameras]
+    points, queries = x["xyz"].shape, x["xyz"][:, 0, :, None]  # each seen by a camera of its own
     return {
-        "lift": space.lift(x["depths"], *cameras),
-        "from_world": coords,
-        "from_world of queries": space.from_world(x["xyz"][:, 0, :, None], *own),  # each seen by a camera of its own
-        "to_world": space.to_world(coords, *cameras, x["depths"]),
-        "to_pixels": space.to_pixels(coords, *cameras),
+        "lift": (space.lift(x["depths"], *cameras), (*x["depths"].shape, 3)),
+        "from_world": (coords, points),
+        "from_world of queries": (space.from_world(queries, *own), queries.shape),
+        "to_world": (space.to_world(coords, *cameras, x["depths"]), points),
+        "to_pixels": (space.to_pixels(coords, *cameras), (*points[:3], 2)),
     }
-
-
-def _space_shapes(owner: Tracker, x: Tensors, out: Tensors) -> dict:
-    points, grid = tuple(x["xyz"].shape), tuple(x["depths"].shape)
-    wanted = (*grid, 3), points, (_BATCH, _TRACKS, 1, 3), points, (*points[:3], 2)
-    return dict(zip(out, wanted, strict=True))
 
 
 def _space_facts(owner: Tracker, x: Tensors, out: Tensors) -> list:
@@ -149,17 +132,12 @@ def _space_facts(owner: Tracker, x: Tensors, out: Tensors) -> list:
     ]
 
 
-def _neighborhood(owner: Tracker, x: Tensors) -> Tensors:
-    near = owner.neighborhood(_level(x), x["coords"], x["cells"])
-    found = {name: getattr(near, name) for name in ("features", "points", "center", "indices")}
-    return {name: value for name, value in found.items() if value is not None}
-
-
-def _neighborhood_shapes(owner: Tracker, x: Tensors, out: Tensors) -> dict:
-    lead = tuple(x["coords"].shape[:3])
-    count = out["points"].shape[3] if out["points"].ndim == 5 else owner.config.neighbors
-    wanted = {"features": (*lead, count, x["features"].shape[-1]), "points": (*lead, count, 3), "center": (*lead, 3)}
-    return wanted | ({"indices": (*lead, count)} if "indices" in out else {})
+def _neighborhood(owner: Tracker, x: Tensors) -> Outputs:
+    near, lead = owner.neighborhood(_level(x), x["coords"], x["cells"]), x["coords"].shape[:3]
+    count = near.points.shape[3] if near.points.ndim == 5 else owner.config.neighbors
+    out = {"features": (near.features, (*lead, count, x["features"].shape[-1]))}
+    out |= {"points": (near.points, (*lead, count, 3)), "center": (near.center, (*lead, 3))}
+    return out if near.indices is None else {**out, "indices": (near.indices, (*lead, count))}
 
 
 def _neighborhood_facts(owner: Tracker, x: Tensors, out: Tensors) -> list:
@@ -170,23 +148,23 @@ def _neighborhood_facts(owner: Tracker, x: Tensors, out: Tensors) -> list:
     ]
 
 
-def _context(owner: Tracker, x: Tensors) -> Tensors:
+def _context(owner: Tracker, x: Tensors) -> Outputs:
     level, center, out = _level(x), x["coords"][:, 0], {}
     near = owner.neighborhood(level, x["coords"], x["cells"])
     both = [torch.cat(x, 2) for x in ((x["own"], near.features[:, 0]), (center[:, :, None], near.points[:, 0]))]
     for i in sorted({0, owner.config.levels - 1}):
         near = owner.neighborhood(owner.context.prepare(i, level), x["coords"], x["cells"])
-        out[f"level {i}"] = owner.context(i, owner.context.describe(i, Neighbors(*both, center)), near)
+        kept = owner.context.describe(i, Neighbors(*both, center))
+        out[f"level {i}"] = owner.context(i, kept, near), (*x["coords"].shape[:3], owner.context.width)
     return out
 
 
-def _unseen_tokens(x: Tensors) -> tuple[Tensors, str]:
-    tokens = x["tokens"].clone()
-    tokens[:, :, -1] += 1.0
-    return x | {"tokens": tokens}, "of a track that is not active, which nobody may see"
+def _updater(owner: Tracker, x: Tensors) -> Outputs:
+    out = owner.updater(x["tokens"], x["active"])
+    return {"corrections": (out, (*x["tokens"].shape[:3], max(4, out.shape[-1])))}
 
 
-def _loss(owner: Holder, x: Tensors) -> Tensors:
+def _loss(owner: Tracker, x: Tensors) -> Outputs:
     frames, space, truth = _frames(x), World(), x["xyz"][:, :-1].clone()  # the last frame is padded
     truth[:, 2, 0] = torch.nan
     cloud = space.lift(frames.depths, frames.intrinsics, frames.extrinsics)
@@ -195,16 +173,7 @@ def _loss(owner: Holder, x: Tensors) -> Tensors:
     terms = owner.loss(step, Truth(truth, x["visible"][:, :-1], x["times"]), 2)
     if not isinstance(terms, tuple | list) or len(terms) != 2:
         raise TypeError(f"it returned {type(terms).__name__}, not a tuple (position, visibility)")
-    return dict(zip(("position", "visibility"), terms, strict=True))
-
-
-def _unseen_estimates(x: Tensors) -> tuple[Tensors, str]:
-    changed = {name: x[name].clone() for name in ("estimate", "logits")}
-    for values in changed.values():
-        values[:, -1] += 0.3  # after the clip's end
-        values[:, :, -1] += 0.3  # no active track
-        values[:, 0, 1] += 0.3  # before the query
-    return x | changed, "after the clip's end, before the query, or of no active track"
+    return {"position": (terms[0], ()), "visibility": (terms[1], ())}
 
 
 def _frames(x: Tensors) -> Frames:
@@ -217,50 +186,25 @@ def _level(x: Tensors) -> Level:
 
 PROBES = {
     "space": Probe(
-        "lift, from_world, to_world and to_pixels as in `model.spaces.Space`",
-        "()",
-        ("rgb", *_CAMERAS, "xyz"),
-        _space,
-        _space_shapes,
-        ("xyz",),
-        facts=_space_facts,
+        "lift, from_world, to_world and to_pixels as in `model.spaces.Space`", "()",
+        ("rgb", *_CAMERAS, "xyz"), _space, ("xyz",), facts=_space_facts,
     ),
     "neighborhood": Probe(
-        "forward(level, coords, cells) as in `model.neighbors.KNearest`",
-        "(config)",
-        _LEVEL,
-        _neighborhood,
-        _neighborhood_shapes,
-        ("features",),
-        {"coords": 2, "cells": 2},
-        facts=_neighborhood_facts,
+        "forward(level, coords, cells) as in `model.neighbors.KNearest`", "(config)",
+        _LEVEL, _neighborhood, ("features",), {"coords": 2, "cells": 2}, facts=_neighborhood_facts,
     ),
     "context": Probe(
-        "prepare, describe and forward(index, kept, near) as in `model.n2n.Context`",
-        "(config)",
-        (*_LEVEL, "own"),
-        _context,
-        lambda owner, x, out: dict.fromkeys(out, (*x["coords"].shape[:3], owner.context.width)),
-        ("features", "own"),
-        {"coords": 2, "cells": 2, "own": 1},
+        "prepare, describe and forward(index, kept, near) as in `model.n2n.Context`", "(config)",
+        (*_LEVEL, "own"), _context, ("features", "own"), {"coords": 2, "cells": 2, "own": 1},
     ),
     "updater": Probe(
-        "forward(tokens, active) as in `model.updater.Transformer`",
-        "(config, inputs)",
-        ("tokens", "active"),
-        lambda owner, x: {"corrections": owner.updater(x["tokens"], x["active"])},
-        lambda owner, x, out: {"corrections": (*x["tokens"].shape[:3], max(4, [*out["corrections"].shape, 0][3]))},
-        ("tokens",),
-        unseen=_unseen_tokens,
+        "forward(tokens, active) as in `model.updater.Transformer`", "(config, inputs)",
+        ("tokens", "active"), _updater, ("tokens",),
     ),
     "loss": Probe(
-        "(step, truth, iterations) -> (position, visibility) as in `training.loss.LossConfig`",
-        "()",
-        ("rgb", *_CAMERAS, "xyz", "estimate", "logits", "visible", "times", "active"),
-        _loss,
-        lambda owner, x, out: dict.fromkeys(out, ()),
+        "(step, truth, iterations) -> (position, visibility) as in `training.loss.LossConfig`", "()",
+        ("rgb", *_CAMERAS, "xyz", "estimate", "logits", "visible", "times", "active"), _loss,
         ("estimate", "logits"),
-        unseen=_unseen_estimates,
     ),
-}
+}  # fmt: skip
 """The probe of each switch, and of the loss."""

@@ -17,7 +17,7 @@ from tapip3d_lite.parts import part_name
 
 _ROOT = Path(__file__).parents[1]
 # What changes no score.
-_UNSEEN = ("figures", "lab", "__main__", "official", "checkpoint_reader", "recorder", "check", "export")
+_UNSEEN = ("figures", "lab", "__main__", "official", "recorder", "check", "export")
 _SEEN = ("lab/conditions.py", "lab/jobs.py")
 
 
@@ -54,9 +54,7 @@ def _config(source: Any) -> Any:
         for name in ("config.json", "study.json"):
             if (path := Path(source) / name).exists():
                 return read_json(path)
-        raise ValueError(
-            f"diff: {source} holds neither config.json nor study.json; give a training's or study's folder"
-        )
+        raise ValueError(f"diff: {source} holds neither config.json nor study.json; give another folder")
     return source.to_dict() if hasattr(source, "to_dict") else json.loads(json.dumps(source, default=plain))
 
 

@@ -45,9 +45,8 @@ def write_report(
     head = [f"minus {table.against}", *(f"{rank + 1}." for rank in range(max([len(x) - 1 for x in cells], default=0)))]
     parts = [f"# {', '.join(plan['rows'])}", str(table)]
     parts += [f"![{name}]({name}.png)" for name in figures]
-    parts += (
-        [f"Clips on which rows differ most ({metric}, mean over seeds):", markdown_table(head, cells)] if cells else []
-    )
+    if cells:
+        parts += [f"Clips on which rows differ most ({metric}, mean over seeds):", markdown_table(head, cells)]
     parts += ["## Made with", f"```json\n{json.dumps({k: v for k, v in plan.items() if k != 'code'}, indent=1)}\n```"]
     for name, figure in figures.items():
         save_png(figure, folder / f"{name}.png")
@@ -59,9 +58,8 @@ def write_report(
 
 def explorer(rows: Sequence[str], seeds: int, clips: int, draw: Callable[..., Figure]) -> widgets.Widget:
     """Choices of two rows, a seed and a rank, above the picture that `draw` makes of them."""
-    one, other = (
-        widgets.Dropdown(options=rows, value=rows[i], description=text) for i, text in ((0, "row"), (-1, "other"))
-    )
+    one = widgets.Dropdown(options=rows, value=rows[0], description="row")
+    other = widgets.Dropdown(options=rows, value=rows[-1], description="other")
     rank = widgets.IntSlider(0, 0, clips - 1, description="rank", continuous_update=False)
     seed = widgets.IntSlider(0, 0, seeds - 1, description="seed", continuous_update=False)
     picture, words = widgets.Image(format="png"), widgets.Label()

@@ -73,9 +73,7 @@ class Study:
         folder = Path(folder)
         old = read_json(folder / "study.json") if (folder / "study.json").exists() else None
         if old is None and rows is None:
-            raise ValueError(
-                f"Study: {folder} holds no study; give rows, e.g. [Variant('n2n'), Variant('p2n', context='p2n')]"
-            )
+            raise ValueError(f"Study: {folder} holds no study; give rows, e.g. [Variant('p2n', context='p2n')]")
         if rows is None:
             rows = [Variant.from_dict(name, values, parts) for name, values in old["rows"].items()]
         names = [row.name for row in rows]
@@ -83,9 +81,7 @@ class Study:
             raise ValueError(f"Study: two rows are called {', '.join(twice)}; rename one")
         changes = {k: v for k, v in (("steps", steps), ("minutes", minutes)) if v is not None}
         if not rows or len(changes) > 1:
-            raise ValueError(
-                f"Study: expected rows, and at most one of steps and minutes; got {len(rows)} rows, {changes}"
-            )
+            raise ValueError(f"Study: expected rows, at most one of steps and minutes; got {len(rows)} rows, {changes}")
         seeds = seeds if seeds is not None else old["seeds"] if old else 3
         if not isinstance(seeds, int) or seeds < 1:
             raise ValueError(f"Study.seeds: expected a number of trainings of at least 1, got {seeds!r}")

@@ -118,9 +118,7 @@ def _refuse_at_once(config: TrainConfig, device: str, workers: int | None, compi
         torch.zeros(1, device=device)
     except Exception as error:  # torch has many ways to say that there is no such device
         reason = str(error).splitlines()[0]
-        raise ValueError(
-            f"train: torch sees no {device.upper()} device ({reason}); leave --device out to use the CPU"
-        ) from None
+        raise ValueError(f"train: torch sees no {device.upper()} device ({reason}); leave --device out") from None
     if compiled and not device.startswith("cuda"):
         raise ValueError("train: only a GPU gains from compiling; add --device cuda, or leave --compiled out")
     if (workers or 0) < 0:

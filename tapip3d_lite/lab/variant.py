@@ -53,13 +53,7 @@ class Variant:
         degrade: Any = None,
         **fields: Any,
     ) -> None:
-        """A row.
-
-        Args:
-            name: unlike those of all other rows.
-            tracker: a tracker that is not trained, e.g. `"klt"`.
-            track, degrade: as the attributes.
-            fields: of `TrackerConfig` and `TrainConfig`; `iterations`, which both have, is set in both.
+        """A row: its attributes, where `tracker` is `given`; `iterations`, which tracker and training have, is set in both.
 
         Raises:
             ValueError: no name, a field that neither has (with the nearest ones) or that belongs to the study, fields
@@ -68,13 +62,9 @@ class Variant:
         if not isinstance(name, str) or not name.strip():
             raise ValueError(f"Variant: expected a name, got {name!r}; it heads the row of the table")
         if tracker is not None and fields:
-            raise ValueError(
-                f"Variant {name!r}: {tracker} is not trained, so {', '.join(fields)} cannot differ; use track"
-            )
+            raise ValueError(f"Variant {name!r}: {tracker} is not trained, so {', '.join(fields)} cannot differ")
         if own := sorted(set(fields) & _STUDY):
-            raise ValueError(
-                f"Variant {name!r}: {', '.join(own)} must be equal in all rows; set it in the study's budget"
-            )
+            raise ValueError(f"Variant {name!r}: {', '.join(own)} must be equal in all rows; set it in the budget")
         check_names(f"Variant {name!r}", fields, _TRACKER | _TRAIN)
         check_names(f"Variant {name!r}, track", track or {}, _TRACK | _TRACKER)
         values = {"name": name, "given": None if tracker is None else str(tracker), "fields": dict(fields)}

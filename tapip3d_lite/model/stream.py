@@ -177,9 +177,7 @@ def _checked(queries: Any) -> np.ndarray:
     rows = floats("queries", queries, (None, 4), finite=True)
     wrong = (rows[:, 0] < 0) | (rows[:, 0] != np.rint(rows[:, 0]))
     if wrong.any():
-        raise ValueError(
-            f"queries: t must be a whole frame number from 0 on, got {rows[wrong][0, 0]:g} in (t, x, y, z)"
-        )
+        raise ValueError(f"queries: t is a whole frame number from 0 on, got {rows[wrong][0, 0]:g} in (t, x, y, z)")
     return rows
 
 

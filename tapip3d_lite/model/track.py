@@ -179,7 +179,7 @@ def check_options(tracker: nn.Module, space: Any, roi: Any, threshold: float | N
     own = tracker.config.space
     if space not in (None, own) and not (own in INTERCHANGEABLE and space in INTERCHANGEABLE):
         raise ValueError(
-            f"space: this tracker was made for {own!r}, got {space!r}; only camera, world and first are exchangeable"
+            f"space: this tracker is for {own!r}, got {space!r}; only camera, world and first are exchangeable"
         )
     if isinstance(roi, str) and roi != "auto":
         raise ValueError(f'depth_roi: expected "auto", None or (near, far), got {roi!r}')

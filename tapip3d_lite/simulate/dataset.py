@@ -16,6 +16,7 @@ from tqdm import tqdm
 from tapip3d_lite.files import locked, read_json, write_text
 from tapip3d_lite.simulate.settings import SimulationConfig
 from tapip3d_lite.simulate.simulator import simulate_clip
+from tapip3d_lite.validate import changed
 
 DESCRIPTION = "dataset.json"
 Recipe = Callable[[int], SimulationConfig]  # the configuration for a seed; at a module's top level: workers import it
@@ -92,9 +93,7 @@ def _claim(folder: Path, config: SimulationConfig | Recipe) -> None:
     if path.exists():
         stored = read_json(path, lambda x: dict(x.get("simulation", x)))
         wanted = json.loads(json.dumps(description.get("simulation", description)))  # with lists for tuples
-        names = [name for name in stored | wanted if stored.get(name) != wanted.get(name)]
-        if names:
-            different = ", ".join(f"{name}={stored.get(name)!r} (now {wanted.get(name)!r})" for name in names)
+        if different := changed(stored, wanted):
             raise ValueError(
                 f"simulate_dataset: {path} describes clips of another configuration: {different}; "
                 "use the same settings or another folder"

@@ -7,7 +7,6 @@ ours are simulated.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,7 +19,7 @@ import torch
 from torch import Tensor
 
 from tapip3d_lite.clip import Clip, Tracks, clip_arrays
-from tapip3d_lite.files import atomic_path, load_npz, map_npy
+from tapip3d_lite.files import atomic_path, digest, load_npz, map_npy
 from tapip3d_lite.formats import load_clip
 from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
@@ -165,7 +164,7 @@ def sample_tracks(clip: Clip, rng: np.random.Generator, config: SamplingConfig) 
     good = np.flatnonzero(visible.mean(0) >= max(config.seen, 1 / len(visible)))
     if not len(good):
         raise ValueError(
-            f"sample_tracks: clip {clip.name!r} shows no track in {config.seen:.0%} of its frames; lower `seen`"
+            f"sample_tracks: {clip.name!r} shows no track in {config.seen:.0%} of its frames; lower `seen`"
         )
     extra = rng.choice(good, max(config.tracks - len(good), 0))
     chosen = rng.choice(np.concatenate([good, extra]), config.tracks, replace=False)
@@ -276,8 +275,7 @@ class FeatureCache:
 
     def _path(self, clip: Path) -> Path:
         if clip not in self._paths:
-            content = hashlib.sha256(clip.read_bytes()).hexdigest()
-            self._paths[clip] = self.folder / f"{clip.stem}-{content[:16]}.npy"
+            self._paths[clip] = self.folder / f"{clip.stem}-{digest(clip.read_bytes())}.npy"
         return self._paths[clip]
 
     @torch.no_grad()

@@ -104,9 +104,7 @@ class TrainConfig:
         check_types(self)
         for name in ("frames", "iterations"):
             if not 1 <= getattr(self, name)[0] <= getattr(self, name)[1]:
-                raise ValueError(
-                    f"TrainConfig.{name}: expected (fewest, most), both at least 1, got {getattr(self, name)}"
-                )
+                raise ValueError(f"TrainConfig.{name}: expected (fewest, most) from 1 on, got {getattr(self, name)}")
         check_range(self, 1, math.inf, "clips", "steps", "batch", "evaluate_every", "save_every")
         check_range(self, 0, math.inf, "matching_steps", "validation", "average", "weight_decay", "head")
         check_range(self, 0, 2**63, "seed")
@@ -174,15 +172,11 @@ class TrainConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as they come back from JSON, classes as `"module:Class"`; ValueError where one has no name."""
-        values = {
-            name: asdict(x) if is_dataclass(x) and not isinstance(x, type) else x for name, x in vars(self).items()
-        }
+        values = {k: asdict(x) if is_dataclass(x) and not isinstance(x, type) else x for k, x in vars(self).items()}
         if type(self.loss) is not LossConfig:
             values["loss"] = part_name(self.loss, "TrainConfig.loss")
-        tracker = {
-            name: part_name(x, f"TrainConfig.tracker[{name!r}]") for name, x in self.tracker.items() if name in SWITCHES
-        }
-        values["tracker"] = self.tracker | tracker
+        named = {k: part_name(x, f"TrainConfig.tracker[{k!r}]") for k, x in self.tracker.items() if k in SWITCHES}
+        values["tracker"] = self.tracker | named
         return json.loads(json.dumps(values))
 
     @classmethod

@@ -17,6 +17,7 @@ from tqdm.auto import tqdm
 from tapip3d_lite.files import atomic_path, locked, read_json, write_text
 from tapip3d_lite.saved import read_saved
 from tapip3d_lite.training.recipe import TrainConfig
+from tapip3d_lite.validate import changed
 
 _SAVED = ("model", "optimizer", "step", "position", "seconds")
 _SMOOTH = 0.98  # of the running means that the bar shows
@@ -43,9 +44,7 @@ class RunFolder:
         """
         saved = read_saved(self._checkpoint) if self._checkpoint.exists() else None
         if saved is not None and not (isinstance(saved, dict) and {*_SAVED} <= saved.keys()):
-            raise ValueError(
-                f"{self._checkpoint}: no checkpoint of a training, which has {', '.join(_SAVED)}; delete it"
-            )
+            raise ValueError(f"{self._checkpoint}: no checkpoint of a training (which has {', '.join(_SAVED)})")
         if not repair:
             return saved
         for leftover in self.path.rglob(".*.*.*"):
@@ -88,9 +87,8 @@ def check_folder(path: str | Path, config: TrainConfig, resume: bool) -> None:
     if not resume:
         raise ValueError(f"train: {path} holds a training already; continue with --resume or choose another folder")
     stored, wanted = read_json(recipe, TrainConfig.complete), config.to_dict()  # imports no parts
-    different = [f"{k}={stored[k]!r} (now {v!r})" for k, v in wanted.items() if stored[k] != v]
-    if different:
-        raise ValueError(f"train: {path} was begun with another recipe: {', '.join(different)}; use its own")
+    if different := changed(stored, wanted):
+        raise ValueError(f"train: {path} was begun with another recipe: {different}; use its own")
 
 
 class Bar(tqdm):
