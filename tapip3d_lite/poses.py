@@ -1,7 +1,8 @@
 """Cameras from RGB-D alone, and a clip whose poses or depths jitter made steady: geometry, nothing learnt.
 
 A tracker lifts pixels by depth and pose; where these jitter the world does, and points at rest seem to move. What rests
-reveals the error: `bundle.py` finds the poses and depth scales that make it agree over the frames.
+reveals the error: `bundle.py` finds the poses and depth scales that make it agree over the frames. Noise that differs
+from pixel to pixel goes before that, by a median of neighbours.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from tapip3d_lite.geometry import invert, transform
 
 _ENOUGH = 12  # matches that must agree on a pose
 _STILL = 0.4  # share of matches that must rest
+_NOISE = 0.002  # relative difference of a typical depth to its neighbours' median, from which on it is noise
 _SLACK = 1.5  # a simpler correction may leave this much more of what rests, in squares
 
 
@@ -59,9 +61,9 @@ def estimate_poses(clip: Clip) -> Clip:
 
 
 def steady_clip(clip: Clip) -> Clip:
-    """The clip without the jitter of its poses and depth scales, or the clip itself where none is found.
+    """The clip without the jitter of its poses and depth scales and the noise of its depths, or itself where none is found.
 
-    Takes poses and depths as about right (to some 5 degrees, or 5 %), and changes what makes the world at rest agree over
+    Noisy depths become the median of their 5 x 5 neighbours; missing ones stay missing. The rest takes poses and depths as about right (to some 5 degrees, or 5 %), and changes what makes the world at rest agree over
     the frames: nothing, one depth scale a frame, the poses, or both; the first of these that explains what rests about as
     well as the last. Corrected poses differ from those given by a mean of zero, so the world stays where it is. Scales
     alone fit the camera's travel, with poses they have a median of 1. Left as they are: clips in which too little rests,
@@ -71,6 +73,7 @@ def steady_clip(clip: Clip) -> Clip:
     depths do, they keep their places. `carry` takes tracks back into the world of the given poses. About a second for 24
     frames of 128 x 128.
     """
+    clip = _smooth(clip)
     views, given = Views(clip), clip.extrinsics.astype(np.float64)
     start = _in_units(given, 1 / views.unit)
     if not (pairs := views.pairs(start)):
@@ -119,6 +122,25 @@ def move(clip: Clip, change: np.ndarray) -> Clip:
 def _moved(queries: np.ndarray, change: np.ndarray) -> np.ndarray:
     places = transform(queries[:, None, 1:].astype(np.float64), change[queries[:, 0].astype(int)])[:, 0]
     return np.concatenate([queries[:, :1], places], -1)
+
+
+def _smooth(clip: Clip) -> Clip:
+    """The clip with depths at the median of their neighbours, if a typical one differs from it."""
+    some = clip.depths[clip.depths.any((1, 2))]
+    some = some[:: max(1, len(some) // 8)]
+    change = np.stack([_median(depth) for depth in some])[some > 0] / some[some > 0]
+    if np.median(np.abs(change - 1)) < _NOISE:
+        return clip
+    return replace(clip, depths=np.stack([_median(depth) for depth in clip.depths]))
+
+
+def _median(depth: np.ndarray, side: int = 5) -> np.ndarray:
+    """The median (H, W) of those of each pixel's side x side neighbours that have depth; 0 where it has none itself."""
+    known = np.pad(np.where(depth > 0, depth, np.nan), side // 2, constant_values=np.nan)
+    near = np.sort(np.lib.stride_tricks.sliding_window_view(known, (side, side)).reshape(*depth.shape, -1))  # NaN last
+    count = np.isfinite(near).sum(-1, keepdims=True).clip(min=1)
+    middle = [np.take_along_axis(near, index, -1)[..., 0] for index in ((count - 1) // 2, count // 2)]
+    return np.where(depth > 0, (middle[0] + middle[1]) / 2, 0).astype(np.float32)
 
 
 def _corrected(clip: Clip, poses: np.ndarray, scale: np.ndarray) -> Clip:
