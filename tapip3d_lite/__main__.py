@@ -27,6 +27,7 @@ from tapip3d_lite.files import check_suffix, write_text
 from tapip3d_lite.formats import FORMATS
 from tapip3d_lite.lab.card import model_card
 from tapip3d_lite.lab.table import JUDGED
+from tapip3d_lite.queries import QueryChoice
 from tapip3d_lite.simulate import simulate_dataset
 from tapip3d_lite.trackers import tracker_runs
 from tapip3d_lite.training.recipe import TrainConfig
@@ -45,8 +46,8 @@ def track(
     ] = (),
     html: Annotated[Path | None, arg(help="3D page with a time slider")] = None,
     png: Annotated[Path | None, arg(help="picture of frames with tracks")] = None,
-    grid: Annotated[int, arg(help="queries on the first frame, side x side, where the clip has none")] = 16,
-    own_queries: Annotated[bool, arg(help="use the clip's own queries where it has some")] = True,
+    points: tyro.conf.OmitArgPrefixes[QueryChoice] = QueryChoice(),  # noqa: B008  (frozen)
+    block: Annotated[int, arg(help="how many points to track at once; fewer take less memory")] = 1024,
     space: Annotated[str | None, arg(help="world or camera; by default the learnt tracker's own")] = None,
     size: Annotated[tuple[int, int] | None, arg(help="height and width to look at (learnt trackers)")] = None,
     crop: Annotated[
@@ -61,14 +62,15 @@ def track(
         if path:
             check_suffix(path, *allowed)  # before the work, not after it
     loaded = t3d.load_clip(clip, format)
-    queries = loaded.queries if own_queries and loaded.queries is not None else t3d.grid_queries(loaded, grid)
-    given = replace(loaded, queries=queries)
+    queries, note = points.of(loaded)
+    own, given = queries is loaded.queries, replace(loaded, queries=queries)
     seen = t3d.steady_clip(given) if steady else given
-    result = t3d.load_tracker(tracker, device, parts=allow).track(seen, space=space, size=size, crop=crop)
+    options = {"space": space, "size": size, "crop": crop, "block": block, "progress": sys.stderr.isatty()}
+    result = t3d.track_many(t3d.load_tracker(tracker, device, parts=allow), seen, **options)
     result = result if seen is given else t3d.carry(result, seen, given)
     shown = result.visible.mean() if result.visible.size else 0.0
-    print(f"{clip}: {len(queries)} points over {len(loaded)} frames with {tracker}, {shown:.0%} visible")
-    if loaded.tracks is not None and own_queries:
+    print(f"{clip}: {len(queries)} points over {len(loaded)} frames with {tracker}, {shown:.0%} visible{note}")
+    if loaded.tracks is not None and own:
         scores = t3d.evaluate(result, loaded)
         print("  ".join(f"{name} {scores[name]:.3f}" for name in ("AJ3D", "APD3D", "OA")))
     for path in out:

@@ -1,38 +1,68 @@
-"""Query points (t, x, y, z): lifted from pixels, or as a grid on a frame."""
+"""Query points (t, x, y, z): lifted from pixels that were chosen, a grid, a mask, or all pixels of a frame."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
 import numpy as np
 
 from tapip3d_lite.clip import Clip, check_queries, query_frames
-from tapip3d_lite.geometry import unproject
-from tapip3d_lite.validate import floats
+from tapip3d_lite.geometry import pixel_grid, unproject
+from tapip3d_lite.validate import bools, floats
 
 
-def queries_from_pixels(clip: Clip, pixels: np.ndarray) -> np.ndarray:
+def has_depth(clip: Clip, pixels: np.ndarray) -> np.ndarray:
+    """Which of the pixels (N, 3), rows (t, u, v), have a valid depth: (N,) bool; ValueError for pixels outside the clip."""
+    return _depths(clip, floats("pixels", pixels, (None, 3), finite=True)) > 0
+
+
+def _depths(clip: Clip, pixels: np.ndarray) -> np.ndarray:
+    """The depth (N,) at the nearest pixel of each row (t, u, v)."""
+    t, nearest = query_frames(clip, pixels), np.rint(pixels[:, 1:]).astype(int)
+    height, width = clip.size
+    outside = ((nearest < 0) | (nearest >= (width, height))).any(-1)
+    if outside.any():
+        row = int(outside.argmax())
+        raise ValueError(
+            f"pixels: row {row} = {pixels[row].tolist()} is outside the {width}x{height} image; u must be in [0, {width - 1}], v in [0, {height - 1}]"
+        )
+    return clip.depths[t, nearest[:, 1], nearest[:, 0]]
+
+
+def queries_from_pixels(clip: Clip, pixels: np.ndarray, on_invalid: str = "raise") -> np.ndarray:
     """Lift pixel queries, rows (t, u, v), to world-space queries, float32 rows (t, x, y, z).
 
     The depth is that of the nearest pixel; (0, 0) is the top-left pixel's centre.
 
+    Args:
+        clip: T frames.
+        pixels: (N, 3), in any of its frames.
+        on_invalid: what to do with rows on invalid depth: "raise", or "skip" them; `has_depth` says which those are.
+
     Raises:
-        ValueError: wrong shape, frame or pixel outside the clip, or invalid depth there.
+        ValueError: wrong shape, frame or pixel outside the clip, or invalid depth there: the message names the rows.
     """
+    if on_invalid not in ("raise", "skip"):
+        raise ValueError(f'on_invalid: expected "raise" or "skip", got {on_invalid!r}')
     pixels = floats("pixels", pixels, (None, 3), finite=True)
-    t = query_frames(clip, pixels)
-    nearest = np.rint(pixels[:, 1:]).astype(int)
-    height, width = clip.size
-    outside = ((nearest < 0) | (nearest >= (width, height))).any(-1)
-    if outside.any():
-        first = pixels[outside][0].tolist()
+    depth = _depths(clip, pixels)
+    lost = np.flatnonzero(depth == 0)
+    if len(lost) and (on_invalid == "raise" or len(lost) == len(pixels)):
+        listed = ", ".join(f"{row} = {pixels[row].tolist()}" for row in lost[:5]) + ", …" * (len(lost) > 5)
         raise ValueError(
-            f"pixels: {first} is outside the {width}x{height} image; u must be in [0, {width - 1}], v in [0, {height - 1}]"
+            f"pixels: {len(lost)} of {len(pixels)} rows fall on invalid depth: {listed}; move them, fill the depth, "
+            'or leave them out: on_invalid="skip"' + " (which would leave none)" * (len(lost) == len(pixels))
         )
-    depth = clip.depths[t, nearest[:, 1], nearest[:, 0]]
-    if not depth.all():
-        first = pixels[depth == 0][0].tolist()
-        raise ValueError(
-            f"pixels: {int((depth == 0).sum())} queries fall on invalid depth, first {first}; move them or fill the depth"
-        )
+    return _lifted(clip, pixels, depth)
+
+
+def _lifted(clip: Clip, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Rows (t, x, y, z) of the pixels (N, 3) whose depth (N,) is known."""
+    pixels, depth = pixels[depth > 0], depth[depth > 0]
+    t = pixels[:, 0].astype(int)
     world = unproject(pixels[:, None, 1:], depth[:, None], clip.intrinsics[t], clip.extrinsics[t])
     return np.concatenate([pixels[:, :1], world[:, 0]], -1)
 
@@ -43,17 +73,62 @@ def grid_queries(clip: Clip, side: int = 16, frame: int = 0, margin: float = 1 /
     The outermost nodes keep `margin` times the image width from every border, as in the released code's support grid;
     in images less than twice as high they lie along the middle.
     Rows (t, x, y, z) are float32, in row-major order.
+
+    Raises:
+        ValueError: a frame outside the clip, or one without depth at any node.
     """
+    return _some(support_queries(clip, side, frame, margin), clip, frame, f"any node of the {side}x{side} grid")
+
+
+def support_queries(clip: Clip, side: int, frame: int = 0, margin: float = 1 / 64) -> np.ndarray:
+    """`grid_queries`, or no rows at all where no node has depth: points that only help others may be missing."""
     if side < 1 or not 0 <= frame < len(clip):
         raise ValueError(f"grid_queries: expected side >= 1, a frame in [0, {len(clip) - 1}], got {side=}, {frame=}")
     height, width = clip.size
     inset = [min(width * margin, (length - 1) / 2) for length in (width, height)]
     u, v = (np.linspace(x, length - x, side) for x, length in zip(inset, (width, height), strict=True))
     u, v = np.meshgrid(u, v)
-    pixels = np.stack([np.full(u.size, frame), u.ravel(), v.ravel()], -1)
+    pixels = np.stack([np.full(u.size, frame), u.ravel(), v.ravel()], -1).astype(np.float32)
     pixels[:, 1:] = np.minimum(pixels[:, 1:], (width - 1, height - 1))
-    nearest = np.rint(pixels[:, 1:]).astype(int)
-    return queries_from_pixels(clip, pixels[clip.depths[frame, nearest[:, 1], nearest[:, 0]] > 0])
+    return _lifted(clip, pixels, _depths(clip, pixels))
+
+
+def dense_queries(clip: Clip, frame: int = 0, mask: np.ndarray | None = None, step: int = 1) -> np.ndarray:
+    """Every pixel of a frame with known depth, or every pixel of a mask in it: float32 rows (t, x, y, z), row-major.
+
+    Args:
+        clip: T frames.
+        frame: where the points are asked.
+        mask: (H, W), bool or 0 and 1, or None for the whole frame.
+        step: takes only every so many rows and columns.
+
+    Raises:
+        ValueError: a frame outside the clip, a mask of another size, or nothing left: an empty mask, no depth in it.
+    """
+    if step < 1 or not 0 <= frame < len(clip):
+        raise ValueError(f"dense_queries: expected step >= 1, a frame in [0, {len(clip) - 1}], got {step=}, {frame=}")
+    chosen = np.zeros(clip.size, bool)
+    chosen[step // 2 :: step, step // 2 :: step] = True
+    if mask is not None:
+        chosen &= bools("mask", mask, clip.size)
+    uv = pixel_grid(*clip.size, like=np.zeros(0, np.float32))[chosen]
+    pixels = np.concatenate([np.full((len(uv), 1), frame, np.float32), uv], 1)
+    where = (
+        "any pixel"
+        if mask is None
+        else f"any of the {len(uv)} pixels that the mask shows on every {step}. row and column"
+    )
+    return _some(_lifted(clip, pixels, clip.depths[frame][chosen]), clip, frame, where)
+
+
+def _some(queries: np.ndarray, clip: Clip, frame: int, where: str) -> np.ndarray:
+    if len(queries):
+        return queries
+    share = (clip.depths[frame] > 0).mean()
+    raise ValueError(
+        f"queries: none left, since frame {frame} has no valid depth at {where} ({share:.1%} of its pixels have one); "
+        "choose another frame or place, or fill the depth"
+    )
 
 
 def resolve_queries(clip: Clip, queries: np.ndarray | None, grid: int = 16) -> np.ndarray:
@@ -61,3 +136,58 @@ def resolve_queries(clip: Clip, queries: np.ndarray | None, grid: int = 16) -> n
     if queries is not None:
         return check_queries(clip, queries)
     return grid_queries(clip, grid) if clip.queries is None else clip.queries
+
+
+@dataclass(frozen=True)
+class QueryChoice:
+    """Which points to track, as the command line asks it: the first of these that is given.
+
+    Attributes:
+        pixels: text file with a query a line: frame, u, v.
+        mask: image in which the pixels to track are not black.
+        dense: track every pixel of a frame that has depth.
+        own_queries: use the clip's own queries where it has some.
+        grid: queries on a frame, side x side.
+        frame: where grid, mask and dense queries are asked.
+        step: of mask and dense queries take every so many rows and columns.
+        on_invalid: what to do with pixels on invalid depth, raise an error or skip them.
+    """
+
+    pixels: Path | None = None
+    mask: Path | None = None
+    dense: bool = False
+    own_queries: bool = True
+    grid: int = 16
+    frame: int = 0
+    step: int = 1
+    on_invalid: Literal["raise", "skip"] = "raise"
+
+    def of(self, clip: Clip) -> tuple[np.ndarray, str]:
+        """The rows (t, x, y, z) on a clip, and which lines were skipped, in words.
+
+        Raises:
+            ValueError: unreadable files, or as for the functions above.
+        """
+        if self.pixels is not None:
+            try:
+                rows = np.loadtxt(self.pixels, np.float32, delimiter=",", ndmin=2, encoding="utf-8")
+            except (OSError, ValueError) as error:
+                raise ValueError(f"{self.pixels}: expected lines of numbers, frame,u,v ({error})") from None
+            queries, lost = queries_from_pixels(clip, rows, self.on_invalid), np.flatnonzero(~has_depth(clip, rows))
+            note = (
+                f"; {len(lost)} pixels on invalid depth skipped: rows {', '.join(map(str, lost))}" if len(lost) else ""
+            )
+            return queries, note
+        if self.mask is not None or self.dense:
+            mask = None if self.mask is None else _mask(self.mask)
+            return dense_queries(clip, self.frame, mask, self.step), ""
+        own = self.own_queries and clip.queries is not None
+        return clip.queries if own else grid_queries(clip, self.grid, self.frame), ""
+
+
+def _mask(path: Path) -> np.ndarray:
+    data = path.read_bytes() if path.is_file() else b""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    if image is None:
+        raise ValueError(f"{path}: not a readable image; expected a mask of the clip's size, black where not to track")
+    return image > 0

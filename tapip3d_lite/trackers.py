@@ -6,9 +6,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from tqdm.auto import tqdm
+
+from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.evaluation.baselines import Baseline, KltTracker, StaticTracker, TrackerLike
 from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.config import INTERCHANGEABLE
+from tapip3d_lite.queries import resolve_queries
 
 _BASELINES = {"static": StaticTracker, "klt": KltTracker}
 
@@ -59,3 +64,43 @@ def tracker_runs(
             yield from ((f"{label} · {space}", tracker, {"space": space}) for space in spaces)
         else:
             yield f"{label} · {getattr(tracker.space, 'name', 'own space')}", tracker, {}
+
+
+def track_many(
+    tracker: TrackerLike,
+    clip: Clip,
+    queries: np.ndarray | None = None,
+    block: int = 1024,
+    progress: bool = False,
+    **options: Any,
+) -> Tracks:
+    """`tracker.track` of any number of queries in bounded memory, e.g. of `dense_queries(clip)`: one block after another.
+
+    Beside the result, memory is that of one block. Tracks of one block help one another, those of two do not.
+
+    Args:
+        tracker: any tracker.
+        clip: T frames.
+        queries: (N, 4) rows (t, x, y, z); None: the clip's own, else a grid on the first frame.
+        block: how many are tracked at once; as many as there are give what `track` gives.
+        progress: show a bar.
+        options: of `track`.
+
+    Raises:
+        ValueError: a block of less than one, or as `track` does.
+    """
+    if block < 1:
+        raise ValueError(f"track_many: block must be at least 1, got {block}")
+    queries = resolve_queries(clip, queries)
+    starts = range(0, max(len(queries), 1), block)
+    xyz = np.empty((len(clip), len(queries), 3), np.float32)
+    visible, logits = np.empty(xyz.shape[:2], bool), np.empty(xyz.shape[:2], np.float32)
+    for start in tqdm(starts, desc="blocks", disable=not progress or len(starts) == 1):
+        some = slice(start, start + block)
+        part = tracker.track(clip, queries[some], progress=progress and len(starts) == 1, **options)
+        xyz[:, some], visible[:, some] = part.xyz, part.visible
+        if part.visible_logits is None:
+            logits = None
+        else:
+            logits[:, some] = part.visible_logits
+    return Tracks(xyz, visible, queries, logits)

@@ -101,7 +101,9 @@ def arguments(lite, clip, file, folder):
         "load_tracks": {"path": folder / "tracks.npz"},
         "check_queries": {"clip": clip, "queries": rows},
         "grid_queries": {"clip": clip, "side": 3, "frame": 2, "margin": 0.1},
-        "queries_from_pixels": {"clip": clip, "pixels": [[1, 20, 30]]},
+        "queries_from_pixels": {"clip": clip, "pixels": [[1, 20, 30]], "on_invalid": "skip"},
+        "has_depth": {"clip": clip, "pixels": [[1, 20, 30]]},
+        "dense_queries": {"clip": clip, "frame": 1, "mask": clip.depths[1] > 0, "step": 40},
         "resolve_queries": {"clip": clip, "queries": rows[:2], "grid": 3},
         "check_clip": {"clip": clip},
         "carry": {"tracks": pred, "source": clip, "target": clip},
@@ -117,6 +119,7 @@ def arguments(lite, clip, file, folder):
         "load_weights": {"path": folder / "lite.safetensors", "device": cpu, "fast": False, "parts": ["mine"]},
         "track": {"tracker": lite, "clip": clip, "queries": rows, "bidirectional": False, "progress": True, **tracking,
                   "size": (96, 96), "crop": (0, 8, 120, 128)},
+        "track_many": {"tracker": lite, "clip": clip, "queries": rows, "block": 4, "progress": True},
         "stream": {"tracker": lite, "queries": rows, "watch": lambda step: None, **tracking},
         "push": frame,
         "contact_sheet": {"clips": [clip, clip], "frames": 2, "width": 1.0},
@@ -207,6 +210,7 @@ def lines(sample, folder):
     ).to_dict()  # fmt: skip
     run, results = folder / "run", folder / "results.json"
     rows = {name: {"tracker": name} for name in ("static", "klt")}
+    (folder / "pixels.csv").write_text("# frame,u,v\n0,10,20\n3,64.5,90\n")
     (folder / "own.json").write_text(json.dumps({"rows": rows, "budget": "tiny"}))
     train = ["train", "--out", run, "--data", folder / "clips", "--device", "cpu", "--workers", 0, "--no-compiled"]
     return [
@@ -215,6 +219,9 @@ def lines(sample, folder):
         ["check", sample, "--format", "npz"],
         ["track", sample, "--tracker", "lite", "--format", "npz", "--out", folder / "out.npz", folder / "out.ply", "--html", folder / "out.html",
          "--png", folder / "out.png", "--space", "camera", "--device", "cpu", "--allow", "mine"],
+        ["track", sample, "--tracker", "klt", "--pixels", folder / "pixels.csv", "--on-invalid", "skip"],
+        ["track", sample, "--tracker", "klt", "--mask", folder / "images" / "rgb" / "000001.png", "--frame", 1, "--step", 20],
+        ["track", sample, "--tracker", "klt", "--dense", "--step", 9, "--block", 50],
         ["track", sample, "--grid", 3, "--no-own-queries", "--size", 96, 96, "--crop", 0, 8, 120, 128, "--steady"],
         ["evaluate", sample, "--tracker", "lite", "static", "--format", "npz", "--device", "cpu", "--allow", "mine"],
         ["benchmark", "--tracker", "lite", "--split", "occlusion", "--space", "camera", "--count", 1, "--out", results,

@@ -21,7 +21,7 @@ from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.track import check_options, visibility
 from tapip3d_lite.model.windows import Scene, State, Step
-from tapip3d_lite.queries import grid_queries
+from tapip3d_lite.queries import support_queries
 from tapip3d_lite.validate import floats
 
 
@@ -93,7 +93,7 @@ class Stream:
         frames = frames_from_clip(clip, device=self.rows.device)
         if self.seen == 0:
             self.space = fitted(self.space, frames)
-            grid = grid_queries(clip, self.grid) if self.grid else self.queries[:0]
+            grid = support_queries(clip, self.grid) if self.grid else self.queries[:0]
             self._begin(np.concatenate([self.queries, grid]))
         with torch.no_grad():
             return self._push(frames, self.tracker.encoder(frames.rgb))

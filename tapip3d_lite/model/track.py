@@ -24,7 +24,7 @@ from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.config import INTERCHANGEABLE, TrackerConfig
 from tapip3d_lite.model.frames import Frames, crop_clip, frames_from_clip, resize_clip
-from tapip3d_lite.queries import grid_queries, resolve_queries
+from tapip3d_lite.queries import resolve_queries, support_queries
 
 _KEPT = 2**27  # floats of features kept for a whole clip (512 MiB); of longer clips only a window's are
 
@@ -157,7 +157,7 @@ def _one_way(way: Callable, queries: np.ndarray, grid: np.ndarray, options: dict
 
 
 def _grid(clip: Clip, side: int, frame: int) -> np.ndarray:
-    return grid_queries(clip, side, frame) if side else np.zeros((0, 4), np.float32)
+    return support_queries(clip, side, frame) if side else np.zeros((0, 4), np.float32)
 
 
 def _flip_time(rows: np.ndarray, frames: int) -> np.ndarray:
