@@ -14,6 +14,7 @@ _HOMES = {
     "clip": ["Clip", "Tracks", "check_queries", "load_tracks"],
     "formats": ["load_clip", "save_clip"],
     "queries": ["dense_queries", "grid_queries", "has_depth", "queries_from_pixels", "resolve_queries"],
+    "depth": ["densify_depth", "filter_depth", "register_depth", "stereo_depth"],
     "check": ["check_clip"],
     "poses": ["carry", "estimate_poses", "steady_clip"],
     "simulate": ["SimulationConfig", "simulate_clip"],

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 import tapip3d_lite as t3d
+from tapip3d_lite.depth import register_depth
 from tapip3d_lite.files import load_objects
 from tapip3d_lite.formats import FORMATS
 from tapip3d_lite.formats.arrays import _sparse
-from tapip3d_lite.formats.images import read_depth, register_depth
+from tapip3d_lite.formats.images import read_depth
 from tapip3d_lite.geometry import invert, point_map, project, resize_intrinsics, transform
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.depth import register_depth
 from tapip3d_lite.files import read_json
-from tapip3d_lite.formats.images import decode_color, fit_depth, read_depth, read_video, register_depth
+from tapip3d_lite.formats.images import decode_color, fit_depth, read_depth, read_video
 from tapip3d_lite.geometry import point_map, resize_intrinsics
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenCV's axes and OpenGL's or Blender's

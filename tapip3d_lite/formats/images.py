@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from importlib import import_module
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import cv2
 import numpy as np
 
 from tapip3d_lite.files import map_npy
-from tapip3d_lite.geometry import pixel_grid, project, resize_intrinsics, transform, unproject
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 DEPTHS = (".png", ".tif", ".tiff", ".exr", ".npy", ".pfm")
@@ -82,34 +80,6 @@ def fit_depth(depth: np.ndarray, size: tuple[int, int], name: object) -> np.ndar
             "turn or crop one, or give the depth camera's `depth_intrinsics` in clip.json"
         )
     return cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-
-
-def register_depth(
-    depth: np.ndarray,
-    depth_intrinsics: np.ndarray,
-    intrinsics: np.ndarray,
-    color_from_depth: np.ndarray,
-    size: tuple[int, int],
-) -> np.ndarray:
-    """Depth (h, w) of one camera as the colour camera beside it sees it: (H, W), 0 where nothing was measured.
-
-    X_color = color_from_depth X_depth, rounded to pixels; of several points that meet in one, the nearest counts.
-    A depth camera of fewer pixels than the image is enlarged first, so that its pixels leave no holes.
-    """
-    if depth.shape[0] < size[0]:
-        larger = tuple(math.ceil(size[0] / depth.shape[0]) * n for n in depth.shape)
-        depth_intrinsics = resize_intrinsics(depth_intrinsics, depth.shape, larger)
-        depth = cv2.resize(depth, larger[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-    known = depth > 0
-    uv = pixel_grid(*depth.shape, like=np.zeros(0))[known]
-    points = unproject(uv, depth[known].astype(np.float64), depth_intrinsics)
-    uv, z = project(transform(points, color_from_depth), intrinsics)
-    u, v = np.rint(uv).astype(int).T
-    order = np.argsort(-z)  # the nearest is written last
-    order = order[((z > 0) & (u >= 0) & (v >= 0) & (u < size[1]) & (v < size[0]))[order]]
-    registered = np.zeros(size, np.float32)
-    registered[v[order], u[order]] = z[order]
-    return registered
 
 
 def _exr(path: Path) -> np.ndarray:

@@ -1,0 +1,232 @@
+"""Depth from elsewhere: from a stereo pair, from sparse measurements, from a camera beside; and what is no surface removed.
+
+    z = f b / d                                    d: how far a point moves between two views at a distance b
+    flying:  few of the neighbours q' of q = 1 / z have |q' - q| < slack q  or  |q'' - 2 q' + q| < slack q / 3
+
+On a plane 1 / z is affine over the pixels, however steep it is, so that a neighbour and the next one behind it go on in
+line; a pixel that a sensor mixed of front and back stands on neither.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from tapip3d_lite.geometry import pixel_grid, project, resize_intrinsics, transform, unproject
+from tapip3d_lite.validate import floats
+
+_SUPPORT = 3  # neighbours of eight that a pixel on a surface has at least, also at a corner
+_ROWS = 1.0  # pixels by which points of a rectified pair may differ in height
+
+
+def stereo_depth(
+    left: np.ndarray, right: np.ndarray, intrinsics: np.ndarray, baseline: float, fill: bool = True
+) -> np.ndarray:
+    """The depth of the left images of rectified pairs, by semi-global matching (OpenCV's SGBM) to a 16th of a pixel.
+
+    A disparity counts if matching from right to left gives the same within a pixel. What only the left camera sees takes
+    the farther of the two depths beside it in its row, since near things hide far ones.
+
+    Args:
+        left: (T, H, W, 3) uint8.
+        right: the same from a camera `baseline` to the right, with the same intrinsics and parallel axes.
+        intrinsics: (3, 3) or (T, 3, 3), pixels.
+        baseline: distance of the cameras in scene units.
+        fill: False leaves pixels without a match at 0.
+
+    Returns:
+        (T, H, W) float32 z-depth.
+
+    Raises:
+        ValueError: images of other sizes or dtypes, a baseline that is not positive, pairs that are swapped or not
+            rectified (points differ in height), or in which nothing matches.
+    """
+    left, right = np.asarray(left), np.asarray(right)
+    for name, images in (("left", left), ("right", right)):
+        if (
+            images.ndim != 4
+            or images.shape[-1] != 3
+            or images.dtype != np.uint8
+            or not images.size
+            or images.shape != left.shape
+        ):
+            wanted = "(T, H, W, 3)" if name == "left" else str(left.shape)
+            raise ValueError(
+                f"{name}: expected {wanted} uint8 RGB, got {images.shape} {images.dtype}; both need one size, [0, 1] floats times 255"
+            )
+    if not 0 < baseline < math.inf:
+        raise ValueError(f"baseline: expected a positive distance in scene units, got {baseline}")
+    single = np.ndim(intrinsics) == 2
+    focal = floats("intrinsics", intrinsics, (3, 3) if single else (len(left), 3, 3), finite=True)[..., 0, 0]
+    focal = np.broadcast_to(focal, len(left))
+    scale = max(1, math.ceil(384 / left.shape[2]))  # of small images a 16th of a pixel is too coarse
+    gray = [[cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images] for images in (left, right)]
+    most = _largest_disparity(*gray) * scale
+    depths = np.zeros(left.shape[:3], np.float32)
+    for t, pair in enumerate(zip(*gray, strict=True)):
+        disparity = _matched(
+            *(cv2.resize(x, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC) for x in pair), most
+        )
+        disparity = _reduced(disparity, scale) / scale
+        np.divide(focal[t] * baseline, disparity, out=depths[t], where=disparity > 0)
+    if not depths.any():
+        raise ValueError(
+            "stereo_depth: nothing in the right images matches the left ones; are they of one place and time?"
+        )
+    return densify_depth(np.stack([_beside(depth) for depth in depths])) if fill else depths
+
+
+def _largest_disparity(left: list[np.ndarray], right: list[np.ndarray]) -> int:
+    """How far corners move at most, found by optical flow with some room; ValueError unless they move level, to the left."""
+    moves = []
+    for one, two in zip(left[:: max(1, len(left) // 8)], right[:: max(1, len(left) // 8)], strict=True):
+        corners = cv2.goodFeaturesToTrack(one, 300, 0.01, 3)
+        if corners is not None:
+            there, found, _ = cv2.calcOpticalFlowPyrLK(one, two, corners, None)
+            back, again, _ = cv2.calcOpticalFlowPyrLK(two, one, there, None)
+            good = (found & again).ravel().astype(bool) & (np.abs(back - corners).max((1, 2)) < 0.3)
+            moves.append((there - corners)[good, 0])
+    moves = np.concatenate(moves) if moves else np.zeros((0, 2))
+    if len(moves) < 8:
+        return one.shape[1] // 4  # too blank to tell
+    across, down = np.median(moves[:, 0]), np.median(np.abs(moves[:, 1]))
+    if down > _ROWS or across > 0.5:
+        wrong = f"differ in height by {down:.1f} px" if down > _ROWS else f"lie {across:.1f} px to the right in `right`"
+        remedy = "rectify the pair (cv2.stereoRectify)" if down > _ROWS else "swap left and right"
+        raise ValueError(f"right: points of the left images {wrong} (median); {remedy}")
+    return math.ceil(1.25 * np.quantile(-moves[:, 0], 0.98)) + 4
+
+
+def _matched(left: np.ndarray, right: np.ndarray, most: int) -> np.ndarray:
+    """Disparities (H, W) of the left image up to `most` where both directions agree, else 0."""
+    count = -(-most // 16) * 16
+    matcher = cv2.StereoSGBM.create(0, count, 5, 8 * 25, 32 * 25, 1, 31, 5, 0, 0, cv2.STEREO_SGBM_MODE_HH)
+    # A margin on the left, where the search would leave the image; mirrored images are matched from right to left.
+    pair = [cv2.copyMakeBorder(x, 0, 0, count, count, cv2.BORDER_REPLICATE) for x in (left, right)]
+    ours = matcher.compute(*pair)[:, count:-count] / np.float32(16)
+    theirs = matcher.compute(*(np.ascontiguousarray(x[:, ::-1]) for x in pair[::-1]))[:, ::-1][:, count:-count] / 16
+    v, u = np.indices(left.shape)
+    source = np.rint(u - ours).astype(int)
+    seen = theirs[v, np.clip(source, 0, left.shape[1] - 1)]
+    return np.where((ours > 0) & (source >= 0) & (np.abs(seen - ours) <= 1), ours, np.float32(0))
+
+
+def _reduced(disparity: np.ndarray, scale: int) -> np.ndarray:
+    """The median of the known ones of each scale x scale block, which mixes no surfaces; 0 where most are unknown."""
+    height, width = disparity.shape
+    blocks = disparity.reshape(height // scale, scale, width // scale, scale).swapaxes(1, 2).reshape(-1, scale * scale)
+    ordered, known = np.sort(blocks, 1), (blocks > 0).sum(1)
+    middle = ordered[np.arange(len(blocks)), scale * scale - 1 - known // 2]  # the unknown ones are first
+    return np.where(known * 2 > scale * scale, middle, 0).reshape(height // scale, width // scale)
+
+
+def _beside(depth: np.ndarray) -> np.ndarray:
+    """Holes of a depth map (H, W) filled by the farther of the nearest known depths to the left and right."""
+    sides = []
+    for image in (depth, depth[:, ::-1]):
+        last = np.maximum.accumulate(np.where(image > 0, np.arange(image.shape[1]), 0), 1)
+        sides.append(np.take_along_axis(image, last, 1))
+    return np.where(depth > 0, depth, np.maximum(sides[0], sides[1][:, ::-1]))
+
+
+def densify_depth(depths: np.ndarray) -> np.ndarray:
+    """Sparse depth (T, H, W), 0 = unknown, made dense: each pixel takes the nearest known one's (as the paper does for LiDAR).
+
+    A frame without any stays empty.
+    """
+    depths = _valid(depths)
+    dense = depths.copy()
+    for old, new in zip(depths, dense, strict=True):
+        unknown = (old == 0).astype(np.uint8)
+        if unknown.any() and not unknown.all():
+            kind = cv2.DIST_LABEL_PIXEL
+            _, label = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=kind)
+            values = np.zeros(label.max() + 1, np.float32)
+            values[label[unknown == 0]] = old[unknown == 0]
+            new[:] = values[label]
+    return dense
+
+
+def filter_depth(depths: np.ndarray, edge: float = 0.03) -> np.ndarray:
+    """Depth (T, H, W) without the pixels that lie on no surface: flying ones between front and back, and single errors.
+
+    A pixel is removed (0) if fewer than three of its eight neighbours continue its surface: are about as deep, or go on
+    as a plane does that is seen at a grazing angle. Where depth is noisy, more counts as one surface.
+
+    Args:
+        depths: 0 = unknown.
+        edge: neighbours whose depths differ by more than this share lie on two surfaces.
+
+    Raises:
+        ValueError: no depths (T, H, W), or an edge that is no share.
+    """
+    depths = _valid(depths)
+    if not 0 < edge < 1:
+        raise ValueError(f"edge: expected a share in (0, 1), got {edge}")
+    return np.stack([np.where(_surface(depth, edge), depth, np.float32(0)) for depth in depths])
+
+
+def _surface(depth: np.ndarray, edge: float) -> np.ndarray:
+    """Which pixels (H, W) lie on a surface."""
+    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+    padded = np.pad(inverse, 2, "reflect", reflect_type="odd")  # planes go on beyond the image
+    height, width = depth.shape
+    steps = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x]
+    # The neighbours in eight directions, and what lies behind them: (8, H, W) each.
+    one, two = (
+        np.stack([padded[2 + k * y : 2 + k * y + height, 2 + k * x : 2 + k * x + width] for y, x in steps])
+        for k in (1, 2)
+    )
+    there, beyond = (one > 0) & (inverse > 0), (one > 0) & (two > 0) & (inverse > 0)
+    bend = np.abs(two + inverse - 2 * one)
+    # Noise shows in most pixels, edges in few.
+    noise = np.median((bend / np.maximum(inverse, 1e-12))[beyond]) if beyond.any() else 0
+    slack = max(edge, 2 * noise) * inverse
+    goes_on = there & (np.abs(one - inverse) < slack) | beyond & (bend < slack / 3)
+    return goes_on.sum(0) >= _SUPPORT
+
+
+def register_depth(
+    depth: np.ndarray,
+    depth_intrinsics: np.ndarray,
+    intrinsics: np.ndarray,
+    color_from_depth: np.ndarray,
+    size: tuple[int, int],
+) -> np.ndarray:
+    """Depth (h, w) of one camera as the colour camera beside it sees it: (H, W), 0 where nothing was measured.
+
+    X_color = color_from_depth X_depth, rounded to pixels; of several points that meet in one, the nearest counts.
+    A depth camera of fewer pixels than the image is enlarged first, so that its pixels leave no holes.
+
+    Raises:
+        ValueError: no depth (h, w), or matrices of another shape.
+    """
+    depth = floats("depth", depth, (None, None))
+    shapes = {
+        "depth_intrinsics": (depth_intrinsics, 3),
+        "intrinsics": (intrinsics, 3),
+        "color_from_depth": (color_from_depth, 4),
+    }
+    for name, (given, n) in shapes.items():
+        floats(name, given, (n, n), finite=True)
+    if depth.shape[0] < size[0]:
+        larger = tuple(math.ceil(size[0] / depth.shape[0]) * n for n in depth.shape)
+        depth_intrinsics = resize_intrinsics(depth_intrinsics, depth.shape, larger)
+        depth = cv2.resize(depth, larger[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    known = depth > 0
+    uv = pixel_grid(*depth.shape, like=np.zeros(0))[known]
+    points = unproject(uv, depth[known].astype(np.float64), depth_intrinsics)
+    uv, z = project(transform(points, color_from_depth), intrinsics)
+    u, v = np.rint(uv).astype(int).T
+    order = np.argsort(-z)  # the nearest is written last
+    order = order[((z > 0) & (u >= 0) & (v >= 0) & (u < size[1]) & (v < size[0]))[order]]
+    registered = np.zeros(size, np.float32)
+    registered[v[order], u[order]] = z[order]
+    return registered
+
+
+def _valid(depths: np.ndarray) -> np.ndarray:
+    depths = floats("depths", depths, (None, None, None))
+    return np.where(np.isfinite(depths) & (depths > 0), depths, np.float32(0))
