@@ -7,19 +7,19 @@ the truth is known, `tracks`, `visible` and `dynamic`. Tracks on disk are the au
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from pathlib import Path
 
 import numpy as np
 
-from tapip3d_lite.files import load_npz, save_npz
+from tapip3d_lite.files import save_npz
 from tapip3d_lite.geometry import point_map, project
 from tapip3d_lite.validate import bools, check_cameras, check_extras, floats, video_frames
 
-_CLIP_KEYS = ("video", "depths", "intrinsics", "extrinsics")
-_OWN_KEYS = (*_CLIP_KEYS, "query_point", "tracks", "visible", "dynamic", "name", "fps")
+CLIP_KEYS = ("video", "depths", "intrinsics", "extrinsics")
+OWN_KEYS = (*CLIP_KEYS, "query_point", "tracks", "visible", "dynamic", "name", "fps")
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Tracks:
         arrays |= {"visib_logits": self.visible_logits, "dynamic": self.dynamic}
         if clip is not None:
             arrays["video"] = np.moveaxis(clip.video, -1, 1).astype(np.float32) / 255
-            arrays |= {key: getattr(clip, key) for key in _CLIP_KEYS[1:]}
+            arrays |= {key: getattr(clip, key) for key in CLIP_KEYS[1:]}
         save_npz(path, arrays)
 
 
@@ -122,7 +122,7 @@ class Clip:
             raise ValueError(f"Clip.fps: expected a positive number, got {self.fps!r}")
         if not isinstance(self.name, str):
             raise ValueError(f"Clip.name: expected text, got {self.name!r}")
-        check_extras(self.extras, _OWN_KEYS)
+        check_extras(self.extras, OWN_KEYS)
 
     def __len__(self) -> int:
         return len(self.video)
@@ -157,68 +157,18 @@ class Clip:
             queries = queries[begins(queries)] - shift
         # Only what is known to be per frame is cut along: an unknown array may be anything.
         extras = {k: v[frames] if k.endswith("_right") else v for k, v in self.extras.items()}
-        images = {key: getattr(self, key)[frames] for key in _CLIP_KEYS}
+        images = {key: getattr(self, key)[frames] for key in CLIP_KEYS}
         return replace(self, **images, queries=queries, tracks=tracks, extras=extras)
 
     def save(self, path: str | Path) -> None:
         """Write the clip as a compressed npz: to a temporary file first, then renamed, so never half written."""
-        arrays = dict(self.extras) | {key: getattr(self, key) for key in _CLIP_KEYS} | {"query_point": self.queries}
+        arrays = dict(self.extras) | {key: getattr(self, key) for key in CLIP_KEYS} | {"query_point": self.queries}
         if self.tracks is not None:
             if not np.array_equal(self.tracks.queries, self.queries):
                 raise ValueError("Clip.save: tracks.queries differ from clip.queries; a file holds one set of queries")
             arrays |= {"tracks": self.tracks.xyz, "visible": self.tracks.visible, "dynamic": self.tracks.dynamic}
         arrays |= {"name": np.array(self.name), "fps": np.array(self.fps)}
         save_npz(path, arrays)
-
-
-def load_own_clip(path: str | Path, points: bool = True) -> Clip:
-    """Read a clip from the authors' input npz or from one of ours; `formats.load_clip` reads others, too.
-
-    A single (3, 3) or (4, 4) camera is taken for all frames.
-
-    Args:
-        path: the npz file.
-        points: False ignores queries and tracks, for a clip whose cameras may be wrong (`check_clip`).
-
-    Raises:
-        ValueError: the file is missing, truncated, not an npz, needs pickle, or its arrays do not fit together.
-    """
-    arrays, tracks = clip_arrays(path), None
-    if points and "tracks" in arrays:
-        require(path, arrays, "a clip with tracks", ("visible", "query_point"), "add the key or drop tracks")
-        tracks = Tracks(arrays["tracks"], arrays["visible"], arrays["query_point"], None, arrays.get("dynamic"))
-    return Clip(
-        **{key: arrays[key] for key in _CLIP_KEYS},
-        queries=arrays.get("query_point") if points else None,
-        tracks=tracks,
-        name=str(arrays["name"]),
-        fps=arrays["fps"].item() if arrays["fps"].size == 1 else arrays["fps"],
-        extras={key: value for key, value in arrays.items() if key not in _OWN_KEYS},
-    )
-
-
-def clip_arrays(path: str | Path, skip: Collection[str] = (), outline: Collection[str] = ()) -> dict[str, np.ndarray]:
-    """The arrays of a clip's file, with a camera for each frame, `name` and `fps`; `skip`, `outline` as for `load_npz`."""
-    arrays = load_npz(path, skip, outline)
-    remedy = "for RGB-only video estimate depth and pose first (e.g. with MegaSaM)"
-    require(path, arrays, "a clip", [key for key in _CLIP_KEYS if key not in skip], remedy)
-    frames = len(arrays["depths"]) if arrays["depths"].ndim else 0
-    for key in ("intrinsics", "extrinsics"):
-        if arrays[key].ndim == 2:
-            arrays[key] = np.repeat(arrays[key][None], frames, axis=0)
-    return {"name": np.array(Path(path).stem), "fps": np.array(12.0)} | arrays
-
-
-def load_tracks(path: str | Path) -> Tracks:
-    """Read tracks from a result npz (`Tracks.save`, or the authors' result file).
-
-    Raises:
-        ValueError: as for `load_own_clip`.
-    """
-    arrays = load_npz(path)
-    needed = ("coords", "visibs", "query_points")
-    require(path, arrays, "a result", needed, "save one with Tracks.save")
-    return Tracks(*(arrays[key] for key in needed), arrays.get("visib_logits"), arrays.get("dynamic"))
 
 
 def check_queries(clip: Clip, queries: np.ndarray) -> np.ndarray:
@@ -253,16 +203,6 @@ def query_frames(clip: Clip, rows: np.ndarray) -> np.ndarray:
             f"queries: t must be a whole frame index in [0, {len(clip) - 1}], got {t[wrong][0]:g}; the order is (t, ...)"
         )
     return t.astype(int)
-
-
-def require(path: str | Path, arrays: Mapping[str, np.ndarray], what: str, keys: Sequence[str], remedy: str) -> None:
-    """Raise ValueError unless a file's arrays have these keys."""
-    missing = [key for key in keys if key not in arrays]
-    if missing:
-        raise ValueError(
-            f"{path}: {what} needs the keys {', '.join(keys)}; {', '.join(missing)} missing, "
-            f"the file has {', '.join(sorted(arrays)) or 'none'}; {remedy}"
-        )
 
 
 def _set(instance: object, name: str, value: object) -> None:

@@ -125,7 +125,7 @@ def arguments(lite, clip, file, folder):
         "track": {"tracker": lite, "clip": clip, "queries": rows, "bidirectional": False, "progress": True, **tracking,
                   "size": (96, 96), "crop": (0, 8, 120, 128)},
         "track_many": {"tracker": lite, "clip": clip, "queries": rows, "block": 4, "progress": True},
-        "stream": {"tracker": lite, "queries": rows, "watch": lambda step: None, **tracking},
+        "stream": {"tracker": lite, "queries": rows, "watch": lambda step: None, "keep": False, **tracking},
         "push": frame,
         "contact_sheet": {"clips": [clip, clip], "frames": 2, "width": 1.0},
         "depth_map": {"clip": clip, "frame": 1, "ax": ax},

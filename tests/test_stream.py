@@ -7,6 +7,7 @@ import torch
 import tapip3d_lite as t3d
 from tapip3d_lite.model.frames import frames_from_clip
 from tapip3d_lite.recorder import Recorder
+from tests.stream_memory import grown
 from tests.tiny import SYSTEMS
 
 SMALL = {"image_size": (48, 48), "window": 4, "levels": 2, "neighbors": 4, "iterations": 2}
@@ -45,6 +46,11 @@ def offline_frame_by_frame(tracker, clip, **options):
     return xyz[0, : len(clip)].numpy(), logits[0, : len(clip)].numpy()
 
 
+def in_a_window(clip):
+    """(T, N): from the first window on that contains the query. Before, it stays at its place, in the world or in `space`."""
+    return np.arange(len(clip))[:, None] >= np.maximum(0, np.ceil((clip.queries[:, 0] + 1 - 4) / 2) * 2)
+
+
 @pytest.mark.parametrize("space", ["world", "camera", "first"])
 @pytest.mark.parametrize("frames", [2, 3, 8, 11])
 def test_stream_equals_offline(tracker, clip, space, frames):
@@ -54,10 +60,12 @@ def test_stream_equals_offline(tracker, clip, space, frames):
     stream = tracker.stream(part.queries, **options)
     updates = feed(stream, part)
     result = stream.finish()
-    np.testing.assert_allclose(result.xyz, xyz, atol=1e-5)
+    solved = in_a_window(part)
+    np.testing.assert_allclose(result.xyz[solved], xyz[solved], atol=1e-5)
+    np.testing.assert_array_equal(result.xyz[~solved], np.broadcast_to(part.queries[:, 1:], xyz.shape)[~solved])
     np.testing.assert_allclose(result.visible_logits, logits, atol=1e-5)
     offline = tracker.track(part, support_grid=0, bidirectional=False, **options)
-    np.testing.assert_allclose(result.xyz, offline.xyz, atol=0.1)
+    np.testing.assert_allclose(result.xyz[solved], offline.xyz[solved], atol=0.1)
     assert len(updates) == max(0, (frames - 4) // 2 + 1)
     assert all(len(u.xyz) == 4 for u in updates)
     if frames % 2 == 0 and updates:
@@ -70,7 +78,8 @@ def test_stream_of_other_systems(clip, name):
     tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **(SMALL | {"neighbors": 9} | SYSTEMS[name]))).eval()
     stream = tracker.stream(clip.queries)
     feed(stream, clip)
-    np.testing.assert_allclose(stream.finish().xyz, offline_frame_by_frame(tracker, clip)[0], atol=1e-4)
+    xyz, solved = offline_frame_by_frame(tracker, clip)[0], in_a_window(clip)
+    np.testing.assert_allclose(stream.finish().xyz[solved], xyz[solved], atol=1e-4)
 
 
 def test_stream_with_a_support_grid_does_not_tell_it(tracker, clip):
@@ -98,8 +107,101 @@ def test_queries_of_the_future_stand_at_their_query(tracker, clip):
 def test_stream_without_frames_or_with_a_bad_frame(tracker, clip):
     stream = tracker.stream(clip.queries)
     assert stream.finish().xyz.shape == (0, 24, 3)
+    stream = tracker.stream(clip.queries)
     with pytest.raises(ValueError, match=r"Clip\.depths"):
         stream.push(clip.video[0], clip.depths[0][:-1], clip.intrinsics[0], clip.extrinsics[0])
+
+
+def test_queries_come_and_go(tracker, clip):
+    """A query that is added in time is tracked as one known before; one that is dropped leaves no trace in the others."""
+    rows = clip.queries[:6].copy()
+    rows[:, 0] = 0, 0, 0, 0, 5, 6
+    early, late = tracker.stream(rows[[0, 1, 2, 4, 5]]), tracker.stream(rows[:3])
+    updates = feed(early, clip.cut(0, 5))
+    assert late.followed.tolist() == [0, 1, 2]
+    feed(late, clip.cut(0, 5))
+    assert late.add(rows[4:]).tolist() == [3, 4] and late.followed.tolist() == [0, 1, 2, 3, 4]
+    rest = clip.cut(5, 11)
+    updates, same = feed(early, rest), feed(late, rest)
+    for one, two in zip(updates, same, strict=True):
+        np.testing.assert_allclose(one.xyz, two.xyz, atol=1e-6)
+        np.testing.assert_array_equal(one.visible, two.visible)
+    np.testing.assert_allclose(early.finish().xyz, late.finish().xyz, atol=1e-6)
+
+    fewer, many = tracker.stream(rows[[0, 2]]), tracker.stream(rows[:4])
+    many.drop([1, 3])
+    for one, two in zip(feed(fewer, clip), feed(many, clip), strict=True):
+        assert two.xyz.shape == (4, 2, 3) and np.array_equal(two.queries, rows[[0, 2]])
+        np.testing.assert_array_equal(one.xyz, two.xyz)
+    few, all_rows = fewer.finish(), many.finish()
+    np.testing.assert_array_equal(few.xyz, all_rows.xyz[:, [0, 2]])
+    np.testing.assert_array_equal(all_rows.xyz[:, [1, 3]], np.broadcast_to(rows[[1, 3], 1:], (11, 2, 3)))
+    assert not all_rows.visible[:, [1, 3]].any()
+
+
+def test_a_query_dropped_on_the_way_keeps_what_was_found(tracker, clip):
+    stream = tracker.stream(clip.queries[:4] * [0, 1, 1, 1], support_grid=2)
+    before = feed(stream, clip.cut(0, 6))[-1]
+    stream.drop(1)
+    assert stream.add([[4, 0.1, 0.2, 0.3]]).tolist() == [4] and stream.followed.tolist() == [0, 2, 3, 4]
+    after = feed(stream, clip.cut(6, 11))[-1]
+    assert after.xyz.shape == (4, 4, 3)
+    result = stream.finish()
+    np.testing.assert_array_equal(result.xyz[2:6, 1], before.xyz[:, 1])
+    np.testing.assert_array_equal(result.xyz[6:, 1], np.broadcast_to(stream.queries[1, 1:], (5, 3)))
+    assert result.xyz.shape == (11, 5, 3) and not result.visible[6:, 1].any() and not result.visible[:4, 4].any()
+
+
+def test_a_query_added_last_is_still_tracked(tracker, clip):
+    stream = tracker.stream(clip.queries[:3] * [0, 1, 1, 1])
+    feed(stream, clip.cut(0, 6))  # the last window is solved
+    row = clip.queries[3] * [0, 1, 1, 1] + [5, 0, 0, 0]
+    stream.add(row[None])
+    result = stream.finish()
+    assert result.xyz.shape == (6, 4, 3) and not np.array_equal(result.xyz[5, 3], row[1:])
+
+
+def test_a_stream_that_keeps_nothing(tracker, clip):
+    whole, last = tracker.stream(clip.queries), tracker.stream(clip.queries, keep=False)
+    for one, two in zip(feed(whole, clip), feed(last, clip), strict=True):
+        np.testing.assert_array_equal(one.xyz, two.xyz)
+    ours, theirs = last.finish(), whole.finish()
+    np.testing.assert_array_equal(ours.xyz, theirs.xyz[-3:])
+    np.testing.assert_array_equal(ours.visible, theirs.visible[-3:])
+    assert len(last.window) == 2 and last.past.nbytes == 4 * 24 * 5 * 4
+
+
+def test_a_finished_stream_takes_nothing_more(tracker, clip):
+    stream = tracker.stream(clip.queries)
+    feed(stream, clip.cut(0, 5))
+    first = stream.finish()
+    for refused in (lambda: feed(stream, clip), lambda: stream.add(clip.queries)):
+        with pytest.raises(ValueError, match="this stream is finished; begin another"):
+            refused()
+    np.testing.assert_array_equal(stream.finish().xyz, first.xyz)  # once more, the same
+    assert len(first.xyz) == 5
+
+
+def test_bad_additions(tracker, clip):
+    stream = tracker.stream(clip.queries)
+    feed(stream, clip.cut(0, 8))
+    for call, message in (
+        (lambda: stream.add([[5, 0, 0, 1]]), "whole frame number from 6 on, got 5"),
+        (lambda: stream.add([[6.5, 0, 0, 1]]), "whole frame number"),
+        (lambda: stream.add(np.zeros((1, 3))), "queries: expected shape"),
+        (lambda: stream.drop([24]), "drop: expected numbers of"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+    stream.drop(3)
+    with pytest.raises(ValueError, match="drop"):
+        stream.drop(3)
+
+
+def test_memory_stays_constant():
+    """`python -m tests.stream_memory` shows it over 2,000 frames."""
+    tables = grown(frames=60, side=32, points=16)
+    assert tables["keep=False"] < 0.1  # MiB a frame; forgotten frames would be 0.2, their features more
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tapip3d_lite.clip import Clip, load_own_clip
+from tapip3d_lite.clip import Clip
+from tapip3d_lite.clip_files import load_own_clip
 from tapip3d_lite.files import atomic_path, npz_keys, write_text
 from tapip3d_lite.formats.arrays import megasam, read_depths, result, tapvid3d, vggt
 from tapip3d_lite.formats.folders import load_parts

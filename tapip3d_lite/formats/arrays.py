@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tapip3d_lite.clip import Clip, Tracks, require
+from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.clip_files import require
 from tapip3d_lite.files import load_npz, map_npy
 from tapip3d_lite.formats.folders import matrix, numbered
 from tapip3d_lite.formats.images import DEPTHS, decode_color, fit_depth, read_depth

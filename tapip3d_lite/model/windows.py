@@ -122,12 +122,14 @@ class State:
         logits: (B, T', N), starts as 0.
         queries: (B, N, 3) the queries in the trajectories' space.
         times: (B, N) int64 query frames.
+        first: the frame that the first of T' is.
     """
 
     coords: Tensor
     logits: Tensor
     queries: Tensor
     times: Tensor
+    first: int = 0
 
     @classmethod
     def start(cls, queries: Tensor, frames: Frames, space: Any, multiple: int, check: bool = True) -> State:
@@ -165,7 +167,7 @@ class State:
         Tracks queried in the second half have no history yet and start at their query in all frames.
         """
         half = (stop - start) // 2
-        source = torch.arange(start, stop, device=columns.device).clamp(max=start + half - 1)  # (S,)
+        source = torch.arange(start, stop, device=columns.device).clamp(max=start + half - 1) - self.first  # (S,)
         coords, logits = self.coords[:, source][:, :, columns], self.logits[:, source][:, :, columns]
         known = (self.times[:, columns] < start + half)[:, None]  # (B, 1, n)
         coords = torch.where(known[..., None], coords, self.queries[:, None, columns])
@@ -173,7 +175,7 @@ class State:
 
     def write(self, start: int, stop: int, columns: Tensor, active: Tensor, coords: Tensor, logits: Tensor) -> None:
         """Overwrite the window's frames, the overlap with the window before included."""
-        mask = active[:, None]  # (B, 1, n)
+        start, stop, mask = start - self.first, stop - self.first, active[:, None]  # (B, 1, n)
         old = self.coords[:, start:stop, columns], self.logits[:, start:stop, columns]
         self.coords[:, start:stop, columns] = torch.where(mask[..., None], coords, old[0])
         self.logits[:, start:stop, columns] = torch.where(mask, logits, old[1])

@@ -18,7 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tapip3d_lite.clip import Clip, Tracks, clip_arrays
+from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.clip_files import clip_arrays
 from tapip3d_lite.files import atomic_path, digest, load_npz, map_npy
 from tapip3d_lite.formats import load_clip
 from tapip3d_lite.geometry import in_image
