@@ -8,9 +8,12 @@ import os
 import shutil
 import threading
 
+import numpy as np
 import pytest
 
+import tapip3d_lite as t3d
 from lessons.teaching import read_notebook
+from lessons.widgets import PointPicker
 from tests.notebook_tools import FOLDER, ROOT, jupyter_lab
 
 BROWSERS = [
@@ -226,3 +229,17 @@ def changed(page, explorer, before):
 def until(page, condition, argument):
     """Ask a few times a second, which leaves the browser time to draw."""
     page.wait_for_function(condition, arg=argument, polling=200)
+
+
+def test_a_click_on_the_picker_picks_a_point(page):
+    """The picker's picture in a page of its own, where an input stands in for the text box of the widget."""
+    clip = t3d.simulate_clip(seed=5, frames=2, size=(24, 36), tracks=6)
+    picker = PointPicker(clip, width=360)
+    picker.frame.value = 1
+    box = f'<div class="pick-{id(picker)}"><input oninput="window.told = this.value"></div>'
+    page.set_content(picker.children[1].value + box)
+    for place in ((105, 45), (355, 5)):
+        page.locator("img").click(position=dict(zip("xy", place, strict=True)))
+    picker.text.value = page.evaluate("() => window.told")
+    np.testing.assert_allclose(picker.pixels, [[1, 10, 4], [1, 35, 0]], atol=0.1)
+    assert not page.problems

@@ -121,3 +121,21 @@ def test_the_command_lines_choice(clip, tmp_path):
     for name in ("p.csv", "absent.png"):
         with pytest.raises(ValueError, match="not a readable image"):
             QueryChoice(mask=tmp_path / name).of(clip)
+
+
+def test_points_picked_in_the_explorer(clip):
+    from lessons.widgets import PointPicker
+
+    picker = PointPicker(clip, width=360)
+    assert picker.pixels.shape == (0, 3) and "const u=" in picker.children[1].value
+    picker.text.value = "0, 3, 4; 2,6,12;2 30.4 2"  # as clicks and typing leave it
+    np.testing.assert_allclose(picker.pixels, [[0, 3, 4], [2, 6, 12], [2, 30.4, 2]], rtol=1e-6)
+    assert len(t3d.queries_from_pixels(clip, picker.pixels, on_invalid="skip")) == 2
+    assert picker.children[1].value.count("●") == 1
+    picker.frame.value = 2
+    assert "Frame 2" in picker.children[1].value
+    assert picker.children[1].value.count("●") == 1 and picker.children[1].value.count("✕") == 1  # no depth there
+    picker.text.value += "; 1, half"
+    assert "expected t, u, v" in picker.children[1].value
+    with pytest.raises(ValueError, match="expected t, u, v"):
+        picker.pixels  # noqa: B018
