@@ -12,7 +12,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "clip": ["Clip", "Tracks", "check_queries"],
-    "clip_files": ["load_tracks"],
+    "formats.arrays": ["load_tracks"],
     "formats": ["load_clip", "save_clip"],
     "queries": ["dense_queries", "grid_queries", "has_depth", "queries_from_pixels", "resolve_queries"],
     "depth": ["densify_depth", "filter_depth", "register_depth", "stereo_depth"],

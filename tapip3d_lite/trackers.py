@@ -74,20 +74,10 @@ def track_many(
     progress: bool = False,
     **options: Any,
 ) -> Tracks:
-    """`tracker.track` of any number of queries in bounded memory, e.g. of `dense_queries(clip)`: one block after another.
+    """`tracker.track` of any number of queries, e.g. `dense_queries(clip)`, in the memory of one `block` and the result.
 
-    Beside the result, memory is that of one block. Tracks of one block help one another, those of two do not.
-
-    Args:
-        tracker: any tracker.
-        clip: T frames.
-        queries: (N, 4) rows (t, x, y, z); None: the clip's own, else a grid on the first frame.
-        block: how many are tracked at once; as many as there are give what `track` gives.
-        progress: show a bar.
-        options: of `track`.
-
-    Raises:
-        ValueError: a block of less than one, or as `track` does.
+    Tracks of one block help one another, those of two do not. Arguments and errors are those of `track`; `progress`
+    shows a bar.
     """
     if block < 1:
         raise ValueError(f"track_many: block must be at least 1, got {block}")

@@ -19,7 +19,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # later one of a floor's list uses the earlier ones.
 FLOORS = [
     ["geometry", "archive", "pickled", "files", "validate", "outline", "parts"],
-    ["clip", "clip_files", "depth", "queries", "bundle", "poses"],
+    ["clip", "depth", "queries", "bundle", "poses"],
     ["formats"],
     ["check", "simulate", "model"],
     ["variants", "speed"],

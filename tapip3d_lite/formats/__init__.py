@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.clip_files import load_own_clip
 from tapip3d_lite.files import atomic_path, npz_keys, write_text
-from tapip3d_lite.formats.arrays import megasam, read_depths, result, tapvid3d, vggt
+from tapip3d_lite.formats.arrays import load_own_clip, megasam, read_depths, result, tapvid3d, vggt
 from tapip3d_lite.formats.folders import load_parts
 from tapip3d_lite.formats.images import VIDEOS
 from tapip3d_lite.formats.layouts import kubric, movi, plain_folder, record3d, seven_scenes, tum

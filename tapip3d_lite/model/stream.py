@@ -219,13 +219,11 @@ class Stream:
     def _remember(self, tracks: Tracks) -> None:
         """Write a window's tracks over what the one before said; room doubles, so that it is seldom made anew."""
         self.begin = 0 if self.keep else self.state.first
-        stop, count = self.seen - self.begin, len(self.queries)
-        if stop > len(self.past) or count > self.past.shape[1] or not self.keep:
-            longer = 2 * stop if self.keep and stop > len(self.past) else max(stop, len(self.past))
-            room = np.zeros((longer, count, 5), np.float32)
+        stop, (length, count), total = self.seen - self.begin, self.past.shape[:2], len(self.queries)
+        if not self.keep or stop > length or total > count:
+            room = np.zeros((length if stop <= length else stop * (1 + self.keep), total, 5), np.float32)
             room[..., :3] = self.queries[:, 1:]
-            if self.keep:
-                room[: len(self.past), : self.past.shape[1]] = self.past
+            room[: self.keep * length, :count] = self.past[: self.keep * length]
             self.past = room
         values = [tracks.xyz, tracks.visible_logits[..., None], tracks.visible[..., None]]
         self.past[self.state.first - self.begin : stop, self.followed] = np.concatenate(values, -1)

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from tapip3d_lite.clip import Clip, Tracks
-from tapip3d_lite.clip_files import clip_arrays
 from tapip3d_lite.files import atomic_path, digest, load_npz, map_npy
 from tapip3d_lite.formats import load_clip
+from tapip3d_lite.formats.arrays import clip_arrays
 from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.encoder import Encoder

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm.auto import tqdm
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.clip_files import clip_arrays
+from tapip3d_lite.formats.arrays import clip_arrays
 from tapip3d_lite.simulate.dataset import leave_interrupts
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade
 from tapip3d_lite.training.augment import augment

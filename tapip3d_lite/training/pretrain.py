@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.clip_files import clip_arrays
+from tapip3d_lite.formats.arrays import clip_arrays
 from tapip3d_lite.geometry import pixel_grid, project
 from tapip3d_lite.model.blocks import constant
 from tapip3d_lite.model.encoder import Encoder
