@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from tapip3d_lite.geometry import pixel_grid, project, resize_intrinsics, transform, unproject
-from tapip3d_lite.validate import floats
+from tapip3d_lite.validate import floats, video_frames
 
 _SUPPORT = 3  # neighbours of eight that a pixel on a surface has at least, also at a corner
 _ROWS = 1.0  # pixels by which points of a rectified pair may differ in height
@@ -26,8 +26,8 @@ def stereo_depth(
 ) -> np.ndarray:
     """The depth of the left images of rectified pairs, by semi-global matching (OpenCV's SGBM) to a 16th of a pixel.
 
-    A disparity counts if matching from right to left gives the same within a pixel. What only the left camera sees takes
-    the farther of the two depths beside it in its row, since near things hide far ones.
+    Matching from right to left must give the same within a pixel. What only the left camera sees takes the farther of the
+    depths beside it in its row, since near things hide far ones.
 
     Args:
         left: (T, H, W, 3) uint8.
@@ -43,37 +43,24 @@ def stereo_depth(
         ValueError: images of other sizes or dtypes, a baseline that is not positive, pairs that are swapped or not
             rectified (points differ in height), or in which nothing matches.
     """
-    left, right = np.asarray(left), np.asarray(right)
-    for name, images in (("left", left), ("right", right)):
-        if (
-            images.ndim != 4
-            or images.shape[-1] != 3
-            or images.dtype != np.uint8
-            or not images.size
-            or images.shape != left.shape
-        ):
-            wanted = "(T, H, W, 3)" if name == "left" else str(left.shape)
-            raise ValueError(
-                f"{name}: expected {wanted} uint8 RGB, got {images.shape} {images.dtype}; both need one size, [0, 1] floats times 255"
-            )
+    left, right = video_frames(left, "left"), video_frames(right, "right")
+    if left.shape != right.shape:
+        raise ValueError(f"right: expected {left.shape} as left, got {right.shape}; rectify both to one size")
     if not 0 < baseline < math.inf:
         raise ValueError(f"baseline: expected a positive distance in scene units, got {baseline}")
-    single = np.ndim(intrinsics) == 2
-    focal = floats("intrinsics", intrinsics, (3, 3) if single else (len(left), 3, 3), finite=True)[..., 0, 0]
-    focal = np.broadcast_to(focal, len(left))
+    shape = (3, 3) if np.ndim(intrinsics) == 2 else (len(left), 3, 3)
+    focal = np.broadcast_to(floats("intrinsics", intrinsics, shape, finite=True)[..., 0, 0], len(left))
     scale = max(1, math.ceil(384 / left.shape[2]))  # of small images a 16th of a pixel is too coarse
     gray = [[cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images] for images in (left, right)]
     most = _largest_disparity(*gray) * scale
     depths = np.zeros(left.shape[:3], np.float32)
     for t, pair in enumerate(zip(*gray, strict=True)):
-        disparity = _matched(
-            *(cv2.resize(x, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC) for x in pair), most
-        )
-        disparity = _reduced(disparity, scale) / scale
+        larger = (cv2.resize(x, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC) for x in pair)
+        disparity = _reduced(_matched(*larger, most), scale) / scale
         np.divide(focal[t] * baseline, disparity, out=depths[t], where=disparity > 0)
     if not depths.any():
         raise ValueError(
-            "stereo_depth: nothing in the right images matches the left ones; are they of one place and time?"
+            "stereo_depth: nothing in the right images matches the left ones; are they of one time and place?"
         )
     return densify_depth(np.stack([_beside(depth) for depth in depths])) if fill else depths
 
@@ -152,15 +139,8 @@ def densify_depth(depths: np.ndarray) -> np.ndarray:
 def filter_depth(depths: np.ndarray, edge: float = 0.03) -> np.ndarray:
     """Depth (T, H, W) without the pixels that lie on no surface: flying ones between front and back, and single errors.
 
-    A pixel is removed (0) if fewer than three of its eight neighbours continue its surface: are about as deep, or go on
-    as a plane does that is seen at a grazing angle. Where depth is noisy, more counts as one surface.
-
-    Args:
-        depths: 0 = unknown.
-        edge: neighbours whose depths differ by more than this share lie on two surfaces.
-
-    Raises:
-        ValueError: no depths (T, H, W), or an edge that is no share.
+    A pixel is removed (0) if fewer than three of its eight neighbours continue its surface: their depths differ by less
+    than the share `edge` (more where depth is noisy), or go on as on a plane that is seen at a grazing angle.
     """
     depths = _valid(depths)
     if not 0 < edge < 1:
@@ -172,13 +152,10 @@ def _surface(depth: np.ndarray, edge: float) -> np.ndarray:
     """Which pixels (H, W) lie on a surface."""
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
     padded = np.pad(inverse, 2, "reflect", reflect_type="odd")  # planes go on beyond the image
-    height, width = depth.shape
     steps = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x]
     # The neighbours in eight directions, and what lies behind them: (8, H, W) each.
-    one, two = (
-        np.stack([padded[2 + k * y : 2 + k * y + height, 2 + k * x : 2 + k * x + width] for y, x in steps])
-        for k in (1, 2)
-    )
+    views = np.lib.stride_tricks.sliding_window_view(padded, depth.shape)  # (5, 5, H, W)
+    one, two = (np.stack([views[2 + k * y, 2 + k * x] for y, x in steps]) for k in (1, 2))
     there, beyond = (one > 0) & (inverse > 0), (one > 0) & (two > 0) & (inverse > 0)
     bend = np.abs(two + inverse - 2 * one)
     # Noise shows in most pixels, edges in few.
@@ -199,9 +176,6 @@ def register_depth(
 
     X_color = color_from_depth X_depth, rounded to pixels; of several points that meet in one, the nearest counts.
     A depth camera of fewer pixels than the image is enlarged first, so that its pixels leave no holes.
-
-    Raises:
-        ValueError: no depth (h, w), or matrices of another shape.
     """
     depth = floats("depth", depth, (None, None))
     shapes = {

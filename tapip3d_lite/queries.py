@@ -37,13 +37,10 @@ def queries_from_pixels(clip: Clip, pixels: np.ndarray, on_invalid: str = "raise
 
     The depth is that of the nearest pixel; (0, 0) is the top-left pixel's centre.
 
-    Args:
-        clip: T frames.
-        pixels: (N, 3), in any of its frames.
-        on_invalid: what to do with rows on invalid depth: "raise", or "skip" them; `has_depth` says which those are.
+    Rows on invalid depth are named in a ValueError, or left out (`on_invalid="skip"`; `has_depth` says which those are).
 
     Raises:
-        ValueError: wrong shape, frame or pixel outside the clip, or invalid depth there: the message names the rows.
+        ValueError: wrong shape, frame or pixel outside the clip, or invalid depth there.
     """
     if on_invalid not in ("raise", "skip"):
         raise ValueError(f'on_invalid: expected "raise" or "skip", got {on_invalid!r}')
@@ -94,13 +91,9 @@ def support_queries(clip: Clip, side: int, frame: int = 0, margin: float = 1 / 6
 
 
 def dense_queries(clip: Clip, frame: int = 0, mask: np.ndarray | None = None, step: int = 1) -> np.ndarray:
-    """Every pixel of a frame with known depth, or every pixel of a mask in it: float32 rows (t, x, y, z), row-major.
+    """Every pixel of a frame that has depth, or of a mask (H, W) in it, bool or 0 and 1: float32 rows (t, x, y, z), row-major.
 
-    Args:
-        clip: T frames.
-        frame: where the points are asked.
-        mask: (H, W), bool or 0 and 1, or None for the whole frame.
-        step: takes only every so many rows and columns.
+    With `step` only every so many rows and columns are taken.
 
     Raises:
         ValueError: a frame outside the clip, a mask of another size, or nothing left: an empty mask, no depth in it.
@@ -113,12 +106,7 @@ def dense_queries(clip: Clip, frame: int = 0, mask: np.ndarray | None = None, st
         chosen &= bools("mask", mask, clip.size)
     uv = pixel_grid(*clip.size, like=np.zeros(0, np.float32))[chosen]
     pixels = np.concatenate([np.full((len(uv), 1), frame, np.float32), uv], 1)
-    where = (
-        "any pixel"
-        if mask is None
-        else f"any of the {len(uv)} pixels that the mask shows on every {step}. row and column"
-    )
-    return _some(_lifted(clip, pixels, clip.depths[frame][chosen]), clip, frame, where)
+    return _some(_lifted(clip, pixels, clip.depths[frame][chosen]), clip, frame, f"any of the {len(uv)} pixels chosen")
 
 
 def _some(queries: np.ndarray, clip: Clip, frame: int, where: str) -> np.ndarray:

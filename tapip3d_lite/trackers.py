@@ -83,14 +83,9 @@ def track_many(
         raise ValueError(f"track_many: block must be at least 1, got {block}")
     queries = resolve_queries(clip, queries)
     starts = range(0, max(len(queries), 1), block)
-    xyz = np.empty((len(clip), len(queries), 3), np.float32)
-    visible, logits = np.empty(xyz.shape[:2], bool), np.empty(xyz.shape[:2], np.float32)
-    for start in tqdm(starts, desc="blocks", disable=not progress or len(starts) == 1):
-        some = slice(start, start + block)
-        part = tracker.track(clip, queries[some], progress=progress and len(starts) == 1, **options)
-        xyz[:, some], visible[:, some] = part.xyz, part.visible
-        if part.visible_logits is None:
-            logits = None
-        else:
-            logits[:, some] = part.visible_logits
-    return Tracks(xyz, visible, queries, logits)
+    options["progress"] = progress and len(starts) == 1
+    bar = tqdm(starts, desc="blocks", disable=not progress or len(starts) == 1)
+    parts = [tracker.track(clip, queries[start : start + block], **options) for start in bar]
+    xyz, visible = (np.concatenate([getattr(part, name) for part in parts], 1) for name in ("xyz", "visible"))
+    known = parts[0].visible_logits is not None
+    return Tracks(xyz, visible, queries, np.concatenate([part.visible_logits for part in parts], 1) if known else None)

@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-def video_frames(video: np.ndarray) -> np.ndarray:
+def video_frames(video: np.ndarray, name: str = "Clip.video") -> np.ndarray:
     """A video (T, H, W, 3) uint8 with at least one frame, or ValueError."""
     video = np.asarray(video)
     if video.ndim != 4 or video.shape[-1] != 3 or video.dtype != np.uint8:
         raise ValueError(
-            f"Clip.video: expected (T, H, W, 3) uint8 RGB, got {video.shape} {video.dtype}; move the colour axis last, drop alpha, scale [0, 1] floats by 255"
+            f"{name}: expected (T, H, W, 3) uint8 RGB, got {video.shape} {video.dtype}; move the colour axis last, drop alpha, scale [0, 1] floats by 255"
         )
     if 0 in video.shape:
-        raise ValueError(f"Clip.video: zero frames or pixels in {video.shape}; give at least one frame")
+        raise ValueError(f"{name}: zero frames or pixels in {video.shape}; give at least one frame")
     return video
 
 
