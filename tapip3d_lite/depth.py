@@ -24,7 +24,7 @@ _ROWS = 1.0  # pixels by which points of a rectified pair may differ in height
 def stereo_depth(
     left: np.ndarray, right: np.ndarray, intrinsics: np.ndarray, baseline: float, fill: bool = True
 ) -> np.ndarray:
-    """The depth of the left images of rectified pairs, by semi-global matching (OpenCV's SGBM) to a 16th of a pixel.
+    """z-depth (T, H, W) float32 of the left images of rectified pairs, by semi-global matching (SGBM) to a 16th of a pixel.
 
     Matching from right to left must give the same within a pixel. What only the left camera sees takes the farther of the
     depths beside it in its row, since near things hide far ones.
@@ -35,9 +35,6 @@ def stereo_depth(
         intrinsics: (3, 3) or (T, 3, 3), pixels.
         baseline: distance of the cameras in scene units.
         fill: False leaves pixels without a match at 0.
-
-    Returns:
-        (T, H, W) float32 z-depth.
 
     Raises:
         ValueError: images of other sizes or dtypes, a baseline that is not positive, pairs that are swapped or not
@@ -50,13 +47,14 @@ def stereo_depth(
         raise ValueError(f"baseline: expected a positive distance in scene units, got {baseline}")
     shape = (3, 3) if np.ndim(intrinsics) == 2 else (len(left), 3, 3)
     focal = np.broadcast_to(floats("intrinsics", intrinsics, shape, finite=True)[..., 0, 0], len(left))
-    scale = max(1, math.ceil(384 / left.shape[2]))  # of small images a 16th of a pixel is too coarse
+    # A 16th of a pixel is too coarse for small images. The scale is odd: middles of blocks are the old pixels' centres.
+    scale = 1 + 2 * max(0, math.ceil(192 / left.shape[2] - 0.5))
     gray = [[cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images] for images in (left, right)]
     most = _largest_disparity(*gray) * scale
     depths = np.zeros(left.shape[:3], np.float32)
     for t, pair in enumerate(zip(*gray, strict=True)):
         larger = (cv2.resize(x, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC) for x in pair)
-        disparity = _reduced(_matched(*larger, most), scale) / scale
+        disparity = _matched(*larger, most)[scale // 2 :: scale, scale // 2 :: scale] / scale
         np.divide(focal[t] * baseline, disparity, out=depths[t], where=disparity > 0)
     if not depths.any():
         raise ValueError(
@@ -98,15 +96,6 @@ def _matched(left: np.ndarray, right: np.ndarray, most: int) -> np.ndarray:
     source = np.rint(u - ours).astype(int)
     seen = theirs[v, np.clip(source, 0, left.shape[1] - 1)]
     return np.where((ours > 0) & (source >= 0) & (np.abs(seen - ours) <= 1), ours, np.float32(0))
-
-
-def _reduced(disparity: np.ndarray, scale: int) -> np.ndarray:
-    """The median of the known ones of each scale x scale block, which mixes no surfaces; 0 where most are unknown."""
-    height, width = disparity.shape
-    blocks = disparity.reshape(height // scale, scale, width // scale, scale).swapaxes(1, 2).reshape(-1, scale * scale)
-    ordered, known = np.sort(blocks, 1), (blocks > 0).sum(1)
-    middle = ordered[np.arange(len(blocks)), scale * scale - 1 - known // 2]  # the unknown ones are first
-    return np.where(known * 2 > scale * scale, middle, 0).reshape(height // scale, width // scale)
 
 
 def _beside(depth: np.ndarray) -> np.ndarray:
@@ -178,13 +167,9 @@ def register_depth(
     A depth camera of fewer pixels than the image is enlarged first, so that its pixels leave no holes.
     """
     depth = floats("depth", depth, (None, None))
-    shapes = {
-        "depth_intrinsics": (depth_intrinsics, 3),
-        "intrinsics": (intrinsics, 3),
-        "color_from_depth": (color_from_depth, 4),
-    }
-    for name, (given, n) in shapes.items():
-        floats(name, given, (n, n), finite=True)
+    floats("color_from_depth", color_from_depth, (4, 4), finite=True)
+    for name, camera in (("depth_intrinsics", depth_intrinsics), ("intrinsics", intrinsics)):
+        floats(name, camera, (3, 3), finite=True)
     if depth.shape[0] < size[0]:
         larger = tuple(math.ceil(size[0] / depth.shape[0]) * n for n in depth.shape)
         depth_intrinsics = resize_intrinsics(depth_intrinsics, depth.shape, larger)

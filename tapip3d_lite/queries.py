@@ -16,11 +16,12 @@ from tapip3d_lite.validate import bools, floats
 
 def has_depth(clip: Clip, pixels: np.ndarray) -> np.ndarray:
     """Which of the pixels (N, 3), rows (t, u, v), have a valid depth: (N,) bool; ValueError for pixels outside the clip."""
-    return _depths(clip, floats("pixels", pixels, (None, 3), finite=True)) > 0
+    return _with_depth(clip, pixels)[1] > 0
 
 
-def _depths(clip: Clip, pixels: np.ndarray) -> np.ndarray:
-    """The depth (N,) at the nearest pixel of each row (t, u, v)."""
+def _with_depth(clip: Clip, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (N, 3), checked, and the depth (N,) at the nearest pixel of each."""
+    pixels = floats("pixels", pixels, (None, 3), finite=True)
     t, nearest = query_frames(clip, pixels), np.rint(pixels[:, 1:]).astype(int)
     height, width = clip.size
     outside = ((nearest < 0) | (nearest >= (width, height))).any(-1)
@@ -29,7 +30,7 @@ def _depths(clip: Clip, pixels: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"pixels: row {row} = {pixels[row].tolist()} is outside the {width}x{height} image; u must be in [0, {width - 1}], v in [0, {height - 1}]"
         )
-    return clip.depths[t, nearest[:, 1], nearest[:, 0]]
+    return pixels, clip.depths[t, nearest[:, 1], nearest[:, 0]]
 
 
 def queries_from_pixels(clip: Clip, pixels: np.ndarray, on_invalid: str = "raise") -> np.ndarray:
@@ -44,8 +45,7 @@ def queries_from_pixels(clip: Clip, pixels: np.ndarray, on_invalid: str = "raise
     """
     if on_invalid not in ("raise", "skip"):
         raise ValueError(f'on_invalid: expected "raise" or "skip", got {on_invalid!r}')
-    pixels = floats("pixels", pixels, (None, 3), finite=True)
-    depth = _depths(clip, pixels)
+    pixels, depth = _with_depth(clip, pixels)
     lost = np.flatnonzero(depth == 0)
     if len(lost) and (on_invalid == "raise" or len(lost) == len(pixels)):
         listed = ", ".join(f"{row} = {pixels[row].tolist()}" for row in lost[:5]) + ", …" * (len(lost) > 5)
@@ -87,7 +87,7 @@ def support_queries(clip: Clip, side: int, frame: int = 0, margin: float = 1 / 6
     u, v = np.meshgrid(u, v)
     pixels = np.stack([np.full(u.size, frame), u.ravel(), v.ravel()], -1).astype(np.float32)
     pixels[:, 1:] = np.minimum(pixels[:, 1:], (width - 1, height - 1))
-    return _lifted(clip, pixels, _depths(clip, pixels))
+    return _lifted(clip, *_with_depth(clip, pixels))
 
 
 def dense_queries(clip: Clip, frame: int = 0, mask: np.ndarray | None = None, step: int = 1) -> np.ndarray:
@@ -151,31 +151,20 @@ class QueryChoice:
     on_invalid: Literal["raise", "skip"] = "raise"
 
     def of(self, clip: Clip) -> tuple[np.ndarray, str]:
-        """The rows (t, x, y, z) on a clip, and which lines were skipped, in words.
-
-        Raises:
-            ValueError: unreadable files, or as for the functions above.
-        """
+        """The rows (t, x, y, z) on a clip, and in words which lines were skipped; ValueError also for unreadable files."""
         if self.pixels is not None:
             try:
                 rows = np.loadtxt(self.pixels, np.float32, delimiter=",", ndmin=2, encoding="utf-8")
             except (OSError, ValueError) as error:
                 raise ValueError(f"{self.pixels}: expected lines of numbers, frame,u,v ({error})") from None
             queries, lost = queries_from_pixels(clip, rows, self.on_invalid), np.flatnonzero(~has_depth(clip, rows))
-            note = (
-                f"; {len(lost)} pixels on invalid depth skipped: rows {', '.join(map(str, lost))}" if len(lost) else ""
-            )
-            return queries, note
-        if self.mask is not None or self.dense:
-            mask = None if self.mask is None else _mask(self.mask)
-            return dense_queries(clip, self.frame, mask, self.step), ""
+            return queries, f"; rows {lost.tolist()} on invalid depth skipped" if len(lost) else ""
+        if self.mask is not None:
+            image = cv2.imread(str(self.mask), cv2.IMREAD_GRAYSCALE) if self.mask.is_file() else None
+            if image is None:
+                raise ValueError(f"{self.mask}: not a readable image; expected a mask, black where not to track")
+            return dense_queries(clip, self.frame, image > 0, self.step), ""
+        if self.dense:
+            return dense_queries(clip, self.frame, step=self.step), ""
         own = self.own_queries and clip.queries is not None
         return clip.queries if own else grid_queries(clip, self.grid, self.frame), ""
-
-
-def _mask(path: Path) -> np.ndarray:
-    data = path.read_bytes() if path.is_file() else b""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
-    if image is None:
-        raise ValueError(f"{path}: not a readable image; expected a mask of the clip's size, black where not to track")
-    return image > 0

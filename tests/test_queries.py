@@ -103,7 +103,7 @@ def test_blocks_are_tracked_one_after_another(clip):
 def test_the_command_lines_choice(clip, tmp_path):
     (tmp_path / "p.csv").write_text("# t, u, v\n2, 6, 12\n0, 3, 4\n")
     rows, note = QueryChoice(pixels=tmp_path / "p.csv", on_invalid="skip").of(clip)
-    assert len(rows) == 1 and note == "; 1 pixels on invalid depth skipped: rows 0"
+    assert len(rows) == 1 and note == "; rows [0] on invalid depth skipped"
     mask = np.zeros(clip.size, np.uint8)
     mask[3, 4:6] = 255
     cv2.imwrite(str(tmp_path / "m.png"), mask)
