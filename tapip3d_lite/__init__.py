@@ -7,6 +7,7 @@ MuJoCo or plotly being imported.
 from __future__ import annotations
 
 from importlib import import_module
+from inspect import isfunction
 
 __version__ = "0.1.0"
 
@@ -39,7 +40,11 @@ def __getattr__(name: str) -> object:
     if name in _MODULES:
         return import_module(f"{__name__}.{name}")
     if name in _HOME_OF:
-        return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+        value = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+        if isfunction(value):  # what users call checks what they give; the library's own calls need not
+            value = import_module(f"{__name__}.validate").checked(value)
+            value.__module__ = __name__  # where a pickle finds it
+        return globals().setdefault(name, value)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

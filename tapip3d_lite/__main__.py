@@ -1,6 +1,6 @@
 """The command line: `python -m tapip3d_lite track IN.npz --out OUT.npz --html OUT.html`.
 
-Bad input ends with one line on standard error and exit code 2; Ctrl-C with exit code 130.
+What cannot work ends with one line on standard error and exit code 2, a lost worker with 1, Ctrl-C with 130.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from tapip3d_lite.formats import FORMATS
 from tapip3d_lite.lab.card import model_card
 from tapip3d_lite.lab.table import JUDGED
 from tapip3d_lite.queries import QueryChoice
+from tapip3d_lite.refusals import later, parsed, refusals
 from tapip3d_lite.simulate import simulate_dataset
 from tapip3d_lite.trackers import tracker_runs
 from tapip3d_lite.training.recipe import TrainConfig
@@ -92,6 +93,8 @@ def evaluate(
     allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
     """Score trackers on clips with true tracks; prints a Markdown table, one row a clip, then the means."""
+    if not (clips and tracker):
+        raise ValueError("evaluate: name at least one clip and one tracker")
     rows, means = {}, {}
     for name in tracker:
         loaded = t3d.load_tracker(name, device, parts=allow)
@@ -227,6 +230,7 @@ def curves(
     from tapip3d_lite.figures.curves import learning_curves
     from tapip3d_lite.training.run_folder import read_log
 
+    check_suffix(out, ".png")
     logs = [(folder.stem if folder.is_file() else folder.resolve().name, read_log(folder)) for folder in folders]
     t3d.figures.save_png(learning_curves(logs, by=by), out)
     print(f"wrote {out}")
@@ -276,22 +280,17 @@ def _train(arguments: list[str]) -> Callable[..., None]:
     """`train` with the defaults of the recipe that `--preset` names."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset", default="lite")
-    return partial(train, config=TrainConfig.recipe(parser.parse_known_args(arguments)[0].preset))
+    return partial(later(train), config=TrainConfig.recipe(parser.parse_known_args(arguments)[0].preset))
 
 
 def main() -> None:
-    """Run one command; bad input ends with one line and exit code 2."""
-    if os.getcwd() not in sys.path:  # as `python -m` does; parts of the user's own are named "module:Class"
-        sys.path.append(os.getcwd())
-    try:
-        chosen = COMMANDS | {"train": _train(sys.argv[1:])}
-        tyro.extras.subcommand_cli_from_dict(chosen, prog="tapip3d_lite", description=__doc__.splitlines()[0])
-    except (ValueError, FloatingPointError) as error:  # the second one: a training's loss
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted; what was finished is kept", file=sys.stderr)
-        sys.exit(130)
+    """Run one command; what cannot work ends with one line and exit code 2, a lost worker with 1."""
+    with refusals():
+        if os.getcwd() not in sys.path:  # as `python -m` does; parts of the user's own are named "module:Class"
+            sys.path.append(os.getcwd())
+        chosen = {name: later(function) for name, function in COMMANDS.items()} | {"train": _train(sys.argv[1:])}
+        about = __doc__.splitlines()[0]
+        parsed(lambda: tyro.extras.subcommand_cli_from_dict(chosen, prog="tapip3d_lite", description=about))()
 
 
 if __name__ == "__main__":

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from numbers import Real
 from pathlib import Path
 
 import numpy as np
 
 from tapip3d_lite.files import save_npz
 from tapip3d_lite.geometry import point_map, project
-from tapip3d_lite.validate import bools, check_cameras, check_extras, floats, video_frames
+from tapip3d_lite.validate import bools, check_about, check_cameras, checked, floats, video_frames
 
 CLIP_KEYS = ("video", "depths", "intrinsics", "extrinsics")
 OWN_KEYS = (*CLIP_KEYS, "query_point", "tracks", "visible", "dynamic", "name", "fps")
@@ -27,7 +26,7 @@ class Tracks:
     """3D trajectories of N points over T frames.
 
     Attributes:
-        xyz: (T, N, 3) float32, world frame, scene units.
+        xyz: (T, N, 3) float32, world frame, scene units; float64 where the world's origin is far away.
         visible: (T, N) bool.
         queries: (N, 4) float32, rows (t, x, y, z): frame index and world position.
         visible_logits: (T, N) float32 before the sigmoid, or None where nothing was estimated.
@@ -44,10 +43,10 @@ class Tracks:
     dynamic: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        _set(self, "xyz", floats("Tracks.xyz", self.xyz, (None, None, 3)))
+        _set(self, "xyz", floats("Tracks.xyz", self.xyz, (None, None, 3), far=True))
         frames, count = self.xyz.shape[:2]
         _set(self, "visible", bools("Tracks.visible", self.visible, (frames, count)))
-        _set(self, "queries", floats("Tracks.queries", self.queries, (count, 4), finite=True))
+        _set(self, "queries", floats("Tracks.queries", self.queries, (count, 4), True, far=True))
         if self.visible_logits is not None:
             _set(self, "visible_logits", floats("Tracks.visible_logits", self.visible_logits, (frames, count)))
         if self.dynamic is not None:
@@ -77,7 +76,7 @@ class Clip:
         video: (T, H, W, 3) uint8, RGB.
         depths: (T, H, W) float32 z-depth in scene units; 0 marks an invalid pixel (non-finite input becomes 0).
         intrinsics: (T, 3, 3) float32, pixels; the top-left pixel's centre is (0, 0).
-        extrinsics: (T, 4, 4) float32, world to camera, OpenCV axes.
+        extrinsics: (T, 4, 4) float32, world to camera, OpenCV axes; float64 is kept where the origin is far away.
         queries: (N, 4) float32 rows (t, x, y, z) in the world frame, or None.
         tracks: the true `Tracks`, or None.
         name: for titles and tables.
@@ -100,17 +99,18 @@ class Clip:
 
     def __post_init__(self) -> None:
         _set(self, "video", video_frames(self.video))
+        check_about(self, OWN_KEYS)
         frames, height, width = self.video.shape[:3]
         depths = floats("Clip.depths", self.depths, (frames, height, width), like="video (T, H, W, 3)")
         depths = np.where(np.isfinite(depths) & (depths > 0), depths, np.float32(0))
-        if not depths.any():
+        if not depths.any() and frames > 1:  # a single frame may be one of a stream
             raise ValueError(
                 "Clip.depths: no valid pixel in the whole clip (all 0, negative or non-finite); check the file's unit and key"
             )
         _set(self, "depths", depths)
         for key, side in (("intrinsics", 3), ("extrinsics", 4)):
             shape, like = (frames, side, side), "video (T, H, W, 3)"
-            _set(self, key, floats(f"Clip.{key}", getattr(self, key), shape, finite=True, like=like))
+            _set(self, key, floats(f"Clip.{key}", getattr(self, key), shape, True, like, key == "extrinsics"))
         check_cameras(self.intrinsics, self.extrinsics)
         if self.queries is None and self.tracks is not None:
             _set(self, "queries", self.tracks.queries)
@@ -118,11 +118,6 @@ class Clip:
             _set(self, "queries", check_queries(self, self.queries))
         if self.tracks is not None and len(self.tracks.xyz) != frames:
             raise ValueError(f"Clip.tracks: expected {frames} frames as in the video, got {len(self.tracks.xyz)}")
-        if not (isinstance(self.fps, Real) and np.isfinite(self.fps) and self.fps > 0):
-            raise ValueError(f"Clip.fps: expected a positive number, got {self.fps!r}")
-        if not isinstance(self.name, str):
-            raise ValueError(f"Clip.name: expected text, got {self.name!r}")
-        check_extras(self.extras, OWN_KEYS)
 
     def __len__(self) -> int:
         return len(self.video)
@@ -139,6 +134,7 @@ class Clip:
         points = point_map(self.depths, self.intrinsics, self.extrinsics if space == "world" else None)
         return np.where(self.depths[..., None] > 0, points, np.float32(np.nan))
 
+    @checked
     def cut(self, start: int, stop: int) -> Clip:
         """Frames [start, stop), with the tracks and queries whose query frame lies inside."""
         if not 0 <= start < stop <= len(self):
@@ -177,7 +173,7 @@ def check_queries(clip: Clip, queries: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: wrong shape, t not a frame of the clip, or a point outside that frame's view.
     """
-    queries = floats("queries", queries, (None, 4), finite=True)
+    queries = floats("queries", queries, (None, 4), finite=True, far=True)
     t = query_frames(clip, queries)
     uv, z = (x[:, 0] for x in project(queries[:, None, 1:], clip.intrinsics[t], clip.extrinsics[t]))
     height, width = clip.size

@@ -20,6 +20,7 @@ import numpy as np
 
 from tapip3d_lite.archive import Archive
 from tapip3d_lite.pickled import Machine, Refused, with_arrays
+from tapip3d_lite.validate import checked
 
 try:
     import fcntl
@@ -205,6 +206,7 @@ def check_suffix(path: str | Path, *allowed: str) -> str:
     return suffix
 
 
+@checked
 def save_npz(path: str | Path, arrays: Mapping[str, np.ndarray | None]) -> None:
     """Write a compressed npz atomically, without what is None; another suffix is a ValueError."""
     check_suffix(path, ".npz")

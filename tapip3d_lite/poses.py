@@ -99,6 +99,9 @@ def carry(tracks: Tracks, source: Clip, target: Clip) -> Tracks:
 
     For tracks of a clip that `steady_clip` or `estimate_poses` made, back to the one that was given.
     """
+    if not len(source) == len(target) == len(tracks.xyz):
+        lengths = f"{len(tracks.xyz)}, {len(source)} and {len(target)}"
+        raise ValueError(f"carry: tracks, source and target must have the same frames, got {lengths}; cut all alike")
     change = invert(target.extrinsics.astype(np.float64)) @ source.extrinsics.astype(np.float64)
     xyz = transform(tracks.xyz.astype(np.float64), change)
     return replace(tracks, xyz=xyz, queries=_moved(tracks.queries, change))

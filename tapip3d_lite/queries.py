@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -168,3 +168,17 @@ class QueryChoice:
             return dense_queries(clip, self.frame, step=self.step), ""
         own = self.own_queries and clip.queries is not None
         return clip.queries if own else grid_queries(clip, self.grid, self.frame), ""
+
+
+def near_origin(clip: Clip, shift: np.ndarray | None = None) -> tuple[Clip, np.ndarray]:
+    """A far clip, without its points, nearer the world's origin, where float32 resolves it; and the shift (3,) float64 in between.
+
+    That is a multiple of 100 times the depth, rounded to a power of ten: so worlds that differ by one become the same.
+    """
+    if shift is None:
+        grid = 100 * 10.0 ** np.floor(np.log10(np.median(clip.depths[clip.depths > 0]))) if clip.depths.any() else 100.0
+        first = clip.extrinsics[0].astype(np.float64)
+        shift = grid * np.rint(np.linalg.solve(first[:3, :3], -first[:3, 3]) / grid)
+    poses = clip.extrinsics.astype(np.float64)
+    poses[:, :3, 3] += poses[:, :3, :3] @ shift
+    return replace(clip, extrinsics=poses, queries=None, tracks=None) if shift.any() else clip, shift

@@ -19,7 +19,9 @@ from torch import Tensor, nn
 from tapip3d_lite.model.blocks import Block, Pool
 from tapip3d_lite.model.n2n import N2N
 from tapip3d_lite.model.neighbors import Neighbors
+from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.windows import Window, to_world
+from tapip3d_lite.validate import checked
 from tapip3d_lite.variants.p2n import P2N
 
 
@@ -84,7 +86,8 @@ class Recorder:
         columns: which tracks: rows of the queries. A window that does not contain one yet records the others.
     """
 
-    def __init__(self, tracker: nn.Module, columns: Sequence[int]) -> None:
+    @checked
+    def __init__(self, tracker: Tracker, columns: Sequence[int]) -> None:
         self.tracker, self.columns = tracker, list(columns)
         self.steps: list[StepRecord] = []
 

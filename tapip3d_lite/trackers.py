@@ -14,6 +14,7 @@ from tapip3d_lite.evaluation.baselines import Baseline, KltTracker, StaticTracke
 from tapip3d_lite.files import shipped_weights
 from tapip3d_lite.model.config import INTERCHANGEABLE
 from tapip3d_lite.queries import resolve_queries
+from tapip3d_lite.validate import check_device, check_names
 
 _BASELINES = {"static": StaticTracker, "klt": KltTracker}
 
@@ -24,7 +25,7 @@ def list_trackers() -> list[str]:
 
 
 def load_tracker(
-    name: str | Path = "lite", device: str = "cpu", fast: bool = True, parts: Sequence[Any] = ()
+    name: str | Path = "lite", device: Any = "cpu", fast: bool = True, parts: Sequence[Any] = ()
 ) -> TrackerLike:
     """A tracker by name, or from a weights file.
 
@@ -36,10 +37,11 @@ def load_tracker(
             that may be imported for it. A file alone never imports code.
 
     Raises:
-        ValueError: neither a known name nor a file, or a file with a custom part that is not among `parts`.
+        ValueError: no such device here, neither a known name nor a file, or a file with a custom part that is not among `parts`.
     """
     name = str(name)
     if name in _BASELINES:
+        check_device(device)
         return _BASELINES[name]()
     path = shipped_weights().get(name, Path(name))
     if not path.is_file():
@@ -56,6 +58,7 @@ def tracker_runs(
 
     A tracker that was made for another space than these runs in its own alone; `parts` as for `load_tracker`.
     """
+    check_names("space", spaces, INTERCHANGEABLE)
     for name in names:
         tracker, label = load_tracker(name, device, True, parts), Path(name).with_suffix("")
         if isinstance(tracker, Baseline):

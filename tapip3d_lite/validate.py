@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterable, Mapping
+import inspect
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import fields
+from functools import wraps
 from numbers import Integral, Real
-from typing import TYPE_CHECKING
+from os import PathLike
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +20,7 @@ if TYPE_CHECKING:
 
 def video_frames(video: np.ndarray, name: str = "Clip.video") -> np.ndarray:
     """A video (T, H, W, 3) uint8 with at least one frame, or ValueError."""
-    video = np.asarray(video)
+    video = _array("Clip.video", video)
     if video.ndim != 4 or video.shape[-1] != 3 or video.dtype != np.uint8:
         raise ValueError(
             f"{name}: expected (T, H, W, 3) uint8 RGB, got {video.shape} {video.dtype}; move the colour axis last, drop alpha, scale [0, 1] floats by 255"
@@ -49,24 +53,34 @@ def check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
         )
 
 
-def check_extras(extras: Mapping[str, np.ndarray], taken: Collection[str]) -> None:
-    """Raise ValueError unless a clip's further arrays have names and values that its file can hold."""
-    for key, value in extras.items():
+def check_about(clip: Any, taken: Collection[str]) -> None:
+    """Raise ValueError unless a clip's name, frame rate and tracks are such, and its further arrays have names and values that its file can hold."""
+    for name in ("name", "fps", "tracks", "extras"):
+        check_type(f"Clip.{name}", clip.__dataclass_fields__[name].type, getattr(clip, name))
+    if not 0 < clip.fps < np.inf:
+        raise ValueError(f"Clip.fps: expected a positive number, got {clip.fps!r}")
+    for key, value in clip.extras.items():
         if not isinstance(key, str) or not key.isprintable() or key in {*taken, "", "file", "allow_pickle"}:
             raise ValueError(f"Clip.extras: expected text that is no key of a clip's file, got {key!r}; rename it")
         if (dtype := np.asarray(value).dtype).kind not in "biufcSUmM" or not dtype.itemsize:
             raise ValueError(f"Clip.extras: {key!r}: expected numbers or text, got dtype {dtype}; convert or drop it")
 
 
-def floats(name: str, value: object, shape: tuple[int | None, ...], finite: bool = False, like: str = "") -> np.ndarray:
-    """`value` as float32 of the given shape (None: any length), or ValueError; `finite` refuses NaN and infinity."""
-    array = np.asarray(value)
+def floats(
+    name: str, value: object, shape: tuple[int | None, ...], finite: bool = False, like: str = "", far: bool = False
+) -> np.ndarray:
+    """`value` as float32 of the given shape (None: any length), or ValueError; `finite` refuses NaN and infinity.
+
+    With `far`, float64 beyond 1,000 stays: places in a world whose origin is far away, which float32 would round by 0.1 mm and more.
+    """
+    array = _array(name, value)
     wanted = "(" + ", ".join("N" if s is None else str(s) for s in shape) + ")" + (f" to match {like}" if like else "")
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name}: expected numbers of shape {wanted}, got dtype {array.dtype}; convert to float32")
     if array.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, array.shape, strict=True)):
         raise ValueError(f"{name}: expected shape {wanted}, got {array.shape}; reorder or resize the axes")
-    array = array.astype(np.float32, copy=False)
+    if not (far and array.dtype == np.float64 and np.nanmax(np.abs(array), initial=0) > 1e3):
+        array = array.astype(np.float32, copy=False)
     if finite and not np.isfinite(array).all():
         raise ValueError(
             f"{name}: expected finite numbers, got {int((~np.isfinite(array)).sum())} NaN or infinite; repair or drop those frames or rows"
@@ -74,9 +88,16 @@ def floats(name: str, value: object, shape: tuple[int | None, ...], finite: bool
     return array
 
 
+def _array(name: str, value: object) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name}: expected an array, got rows of different lengths or no numbers ({error})") from None
+
+
 def bools(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
     """`value` as booleans of the given shape (0 and 1 count), or ValueError."""
-    array = np.asarray(value)
+    array = _array(name, value)
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}; reorder or cut the axes")
     if array.dtype != bool and not (array.dtype.kind in "iuf" and np.isin(array, (0, 1)).all()):
@@ -100,35 +121,68 @@ def check_range(config: object, low: float, high: float, *names: str) -> None:
             raise ValueError(f"{type(config).__name__}.{name}: expected {wanted}, got {value}")
 
 
-_KINDS = {"int": Integral, "float": Real, "bool": bool | np.bool_, "str": str}
+_KINDS = {"bool": bool | np.bool_, "str": str, "None": type(None), "Path": PathLike, "slice": slice, "Mapping": Mapping}
+_OURS = {"Clip", "Tracks", "Tracker", "TrackerConfig", "SimulationConfig", "Figure"}  # other words fit anything
 
 
 def check_types(config: object) -> None:
-    """Raise ValueError unless a dataclass's numbers, switches and text are such, and finite; lists, of JSON, become tuples."""
+    """Raise ValueError unless a dataclass's values are of their types, numbers finite; lists, of JSON, become tuples."""
     for field in fields(config):
-        name, value, kinds = field.name, getattr(config, field.name), [field.type.removesuffix(" | None")]
-        if kinds[0].startswith("tuple["):
-            kinds, value = kinds[0][6:-1].split(", "), tuple(value) if isinstance(value, list) else value
-            object.__setattr__(config, name, value)
-        else:
-            value = (value,)
-        if (value == (None,) and field.type.endswith("| None")) or not set(kinds) <= set(_KINDS):
-            continue
-        if not isinstance(value, tuple) or len(value) != len(kinds) or not all(map(_fits, kinds, value)):
-            got = repr(getattr(config, name))
-            raise ValueError(f"{type(config).__name__}.{name}: expected {field.type}, got {got[:80]}")
+        if field.type.startswith("tuple") and isinstance(getattr(config, field.name), list):
+            object.__setattr__(config, field.name, tuple(getattr(config, field.name)))
+        check_type(f"{type(config).__name__}.{field.name}", field.type, getattr(config, field.name))
 
 
-def _fits(kind: str, value: object) -> bool:
-    switch = isinstance(value, _KINDS["bool"])
-    fits = isinstance(value, _KINDS[kind]) and switch == (kind == "bool")
-    return fits and (kind in ("bool", "str") or abs(value) < 1e300)
+def check_type(name: str, annotation: str, value: object) -> None:
+    """Raise ValueError unless a value is of the type that an annotation says, as far as its words are known here."""
+    if not any(_is(kind, value) for kind in re.split(r" \| (?![^\[]*\])", annotation)):
+        raise ValueError(f"{name}: expected {annotation}, got {value!r}"[:300])
+
+
+def _is(kind: str, value: object) -> bool:
+    if kind.startswith("tuple[") and "..." not in kind:
+        kinds = kind[6:-1].split(", ")
+        return isinstance(value, tuple | list) and len(value) == len(kinds) and all(map(_is, kinds, value))
+    kind = kind.partition("[")[0].rpartition(".")[2]
+    if kind in ("int", "float"):
+        number = isinstance(value, Integral if kind == "int" else Real) and not isinstance(value, _KINDS["bool"])
+        return number and abs(value) < 1e300
+    if kind in ("Sequence", "Collection", "tuple"):
+        return isinstance(value, Collection) and not isinstance(value, str)
+    if kind in _KINDS:
+        return isinstance(value, _KINDS[kind])
+    return kind not in _OURS or kind in {c.__name__ for c in type(value).__mro__}
+
+
+def checked(function: Callable) -> Callable:
+    """A function that first compares arguments with its annotations: a ValueError names one of another type."""
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def call(*given: object, **named: object) -> object:
+        for name, value in signature.bind(*given, **named).arguments.items():
+            if signature.parameters[name].kind in (1, 3):  # neither *names nor **options
+                check_type(f"{function.__qualname__}: {name}", str(signature.parameters[name].annotation), value)
+        return function(*given, **named)
+
+    return call
 
 
 def changed(old: Mapping[str, object], new: Mapping[str, object]) -> str:
     """Each value that differs, as `name=old (now new)`; empty where none does."""
     names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
     return ", ".join(f"{name}={old.get(name)!r} (now {new.get(name)!r})" for name in names)
+
+
+def check_device(device: object) -> None:
+    """Raise ValueError unless torch can compute on a device, such as `"cpu"`, here."""
+    import torch
+
+    try:
+        torch.ones(1, device=device).item()
+    except Exception as error:  # torch has many ways to say that there is no such device
+        why, name = str(error).partition("\n")[0].partition(". ")[0], str(device).upper()
+        raise ValueError(f"device: torch sees no {name} device ({why}); leave --device out to use the CPU") from None
 
 
 def check_state(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
@@ -150,7 +204,7 @@ def check_state(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
 def check_names(where: str, given: Iterable[str], known: Collection[str]) -> None:
     """Raise ValueError for the first name that is not known; it says which known ones are near."""
     for name in given:
-        if name not in known:
-            near = difflib.get_close_matches(name, sorted(known), 3, 0.5)
+        if not isinstance(name, str) or name not in known:
+            near = difflib.get_close_matches(str(name), sorted(known), 3, 0.5)
             hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(sorted(known))}"
             raise ValueError(f"{where}: no {name!r}; {hint}")

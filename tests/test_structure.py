@@ -29,7 +29,7 @@ FLOORS = [
     ["export"],
     ["trackers"],
     ["lab"],
-    ["__main__", ""],
+    ["refusals", "__main__", ""],
 ]
 APART = [("training", "evaluation"), ("variants", "speed"), ("simulate", "model"), ("check", "model")]
 CORE = ["geometry", "clip", "model", "training.loss", "training.backward", "training.trainer"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import cv2
@@ -10,7 +10,8 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project, unproject
-from tapip3d_lite.queries import resolve_queries
+from tapip3d_lite.queries import near_origin, resolve_queries
+from tapip3d_lite.validate import checked
 
 
 class TrackerLike(Protocol):
@@ -23,6 +24,7 @@ class TrackerLike(Protocol):
 class Baseline:
     """Takes the arguments of a learnt tracker's `track`, ignores those that concern only the model, and calls `_follow`."""
 
+    @checked
     def track(
         self,
         clip: Clip,
@@ -41,7 +43,9 @@ class Baseline:
 
         With `bidirectional=False` Lucas-Kanade holds a point still and counts it as hidden before its query.
         """
-        return self._follow(clip, resolve_queries(clip, queries), bidirectional)
+        queries, (near, shift) = resolve_queries(clip, queries), near_origin(clip)
+        found = self._follow(near, (queries - np.r_[0, shift]).astype(np.float32), bidirectional)
+        return replace(found, xyz=found.xyz + shift, queries=queries)
 
 
 @dataclass(frozen=True)

@@ -48,9 +48,11 @@ def run_benchmark(
     """
     for split in splits:
         check_split(split)
+    if count is not None and count < 1:
+        raise ValueError(f"run_benchmark: count must be at least 1, got {count}; leave it out for all clips")
     results, versions = load_results(out) if out and Path(out).exists() else ({}, {})
     wanted = {}
-    for label, tracker, options in runs:
+    for label, tracker, options in list(runs):  # all are there, or refused, before the first one works
         version = version_of(tracker, options)
         if versions.get(label) != version:
             results[label], versions[label] = {}, version
@@ -87,9 +89,12 @@ def save_results(path: str | Path, results: Results, versions: Mapping[str, str 
 
 def load_results(path: str | Path) -> tuple[Results, dict[str, str | None]]:
     """Read what `save_results` wrote: results, and the digest of each label; else ValueError."""
-    rows = read_json(path, lambda x: {k: (row["scores"] | {}, row["version"]) for k, row in x.items()})
-    results = {x: _map(scores, lambda v: math.nan if v is None else v) for x, (scores, _) in rows.items()}
-    return results, {x: version for x, (_, version) in rows.items()}
+
+    def read(rows: dict) -> tuple[Results, dict[str, str | None]]:
+        results = {x: _map(row["scores"], lambda v: math.nan if v is None else float(v)) for x, row in rows.items()}
+        return results, {x: row["version"] for x, row in rows.items()}
+
+    return read_json(path, read)
 
 
 def _map(scores: dict, change: Callable) -> dict:

@@ -156,11 +156,13 @@ def _query_frames(queries: Array | None, shape: tuple[int, int]) -> Array | None
 
 
 def _checked(p: Array, v: Array, q: Array, w: Array, last: int) -> tuple[Array, Array, Array, Array]:
-    p, v, q, w = np.asarray(p, np.float64), np.asarray(v), np.asarray(q, np.float64), np.asarray(w)
-    if p.ndim != 3 or p.shape[-1] != last:
-        raise ValueError(f"truth: expected (T, N, {last}), got {p.shape}; time comes first")
-    if q.shape != p.shape:
-        raise ValueError(f"prediction: expected {p.shape} as the truth, got {q.shape}; track the same queries")
+    name = {2: "uv", 3: "xyz"}[last]
+    p, v, q, w = (np.asarray(x) for x in (p, v, q, w))
+    if p.ndim != 3 or p.shape[-1] != last or p.dtype.kind not in "fiu":
+        raise ValueError(f"truth: expected gt_{name} (T, N, {last}), got {p.shape} {p.dtype}; time comes first")
+    if q.shape != p.shape or q.dtype.kind not in "fiu":
+        raise ValueError(f"prediction: expected {name} {p.shape} as the truth, got {q.shape}; track the same queries")
+    p, q = p.astype(np.float64), q.astype(np.float64)
     for name, flags in (("gt_visible", v), ("visible", w)):
         if flags.shape != p.shape[:2] or flags.dtype != bool:
             raise ValueError(f"{name}: expected {p.shape[:2]} bool, got {flags.shape} {flags.dtype}")

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from tapip3d_lite.figures.flat import contact_sheet, depth_map, frame_with_tracks, overview, track_colors
 from tapip3d_lite.figures.scene_3d import tracks_3d, tracks_3d_static
 from tapip3d_lite.files import atomic_path, check_suffix, write_text
+from tapip3d_lite.validate import checked
 
 __all__ = ["contact_sheet", "depth_map", "frame_with_tracks", "overview", "track_colors"]
 __all__ += ["save_html", "save_png", "show_3d", "tracks_3d", "tracks_3d_static"]
@@ -56,6 +57,7 @@ def png_bytes(figure: Figure, dpi: int = 90) -> bytes:
     return buffer.getvalue()
 
 
+@checked
 def save_png(figure: Figure, path: str | Path, dpi: int = 110) -> None:
     """Write a matplotlib figure as PNG, atomically; another suffix is a ValueError."""
     check_suffix(path, ".png")
@@ -63,6 +65,7 @@ def save_png(figure: Figure, path: str | Path, dpi: int = 110) -> None:
         temporary.write_bytes(png_bytes(figure, dpi))
 
 
+@checked
 def save_html(figure: go.Figure, path: str | Path) -> None:
     """Write a plotly figure as one page that needs no network (plotly.js is inside, about 5 MB), atomically."""
     check_suffix(path, ".html")

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project
+from tapip3d_lite.validate import checked
 
 INK = "#30343b"
 STILL, MOVING = "#2b6cb0", "#d1495b"  # points at rest, points on moving bodies
@@ -30,6 +31,7 @@ def track_colors(clip: Clip, tracks: Tracks) -> np.ndarray:
     return _PALETTE(np.clip(0.5 + 1.7 * (place - 0.5), *_ENDS))[:, :3]
 
 
+@checked
 def check_drawable(clip: Clip, tracks: Tracks | None = None, frame: int = 0) -> None:
     """Refuse (ValueError) a frame outside the clip, or tracks of another length, before a figure fails on them."""
     if not 0 <= frame < len(clip):

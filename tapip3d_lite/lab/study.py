@@ -30,7 +30,7 @@ from tapip3d_lite.lab.table import JUDGED, Table, compare, gaps_by_clip
 from tapip3d_lite.lab.train import interruptible
 from tapip3d_lite.lab.variant import Variant
 from tapip3d_lite.training.run_folder import read_log
-from tapip3d_lite.validate import check_names
+from tapip3d_lite.validate import check_names, checked
 
 
 class Study:
@@ -40,6 +40,7 @@ class Study:
     the same examples, points and augmentations in the same order.
     """
 
+    @checked
     def __init__(
         self,
         folder: str | Path,

@@ -19,7 +19,7 @@ from tapip3d_lite.training.data import training_clips, training_config, validati
 from tapip3d_lite.training.recipe import TrainConfig, initial_weights
 from tapip3d_lite.training.run_folder import RunFolder, check_folder
 from tapip3d_lite.training.trainer import Trainer
-from tapip3d_lite.validate import check_depths
+from tapip3d_lite.validate import check_depths, check_device
 
 _SCORES = ("AJ3D_none", "APD3D_none", "OA", "AJ3D_none_dynamic", "APD3D_none_dynamic", "APD3D_none_static")
 
@@ -83,7 +83,9 @@ def train(
         Whether the training is finished, and a message for the user.
     """
     recipe, data = out / "config.json", data or out / "clips"
-    if resume and recipe.exists():
+    if resume and not recipe.exists():
+        raise ValueError(f"train: {out} holds no training to go on with; check the path, or leave --resume out")
+    if resume:
         config = TrainConfig.read(recipe, [*allow, *config.custom])
     _refuse_at_once(config, device, workers, compiled)
     if workers is None:
@@ -114,11 +116,7 @@ def train(
 
 def _refuse_at_once(config: TrainConfig, device: str, workers: int | None, compiled: bool) -> None:
     """Raise ValueError for what would fail only once the clips are simulated, or hours later."""
-    try:
-        torch.zeros(1, device=device)
-    except Exception as error:  # torch has many ways to say that there is no such device
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"train: torch sees no {device.upper()} device ({reason}); leave --device out") from None
+    check_device(device)
     if compiled and not device.startswith("cuda"):
         raise ValueError("train: only a GPU gains from compiling; add --device cuda, or leave --compiled out")
     if (workers or 0) < 0:

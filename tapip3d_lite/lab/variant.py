@@ -17,7 +17,7 @@ from tapip3d_lite.model.config import SWITCHES, TrackerConfig
 from tapip3d_lite.model.track import track as _track
 from tapip3d_lite.parts import allowed_parts
 from tapip3d_lite.training.recipe import TrainConfig
-from tapip3d_lite.validate import check_names
+from tapip3d_lite.validate import check_names, checked
 
 _TRACKER = {field.name for field in fields(TrackerConfig)}
 _STUDY = {"preset", "tracker", "init", "clips", "matching_steps", "matching", "minutes", "seed", "validation"}
@@ -45,6 +45,7 @@ class Variant:
     track: Mapping[str, Any]
     degrade: Any
 
+    @checked
     def __init__(
         self,
         name: str,

@@ -88,7 +88,7 @@ def frames_from_clip(clip: Clip, size: tuple[int, int] | None = None, device: to
     """
     clip = clip if size is None else resize_clip(clip, size)
     rgb = _tensor(clip.video).to(device).movedim(-1, 1).float() / 255  # (T, H, W, 3) -> (T, 3, H, W)
-    others = (_tensor(x).to(device)[None] for x in (clip.depths, clip.intrinsics, clip.extrinsics))  # B = 1
+    others = (_tensor(x).to(device).float()[None] for x in (clip.depths, clip.intrinsics, clip.extrinsics))  # B = 1
     return Frames(rgb[None], *others)  # (1, T, 3, H, W)
 
 

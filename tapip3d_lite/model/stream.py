@@ -21,8 +21,8 @@ from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.track import check_options, visibility
 from tapip3d_lite.model.windows import Scene, State, Step, to_world
-from tapip3d_lite.queries import support_queries
-from tapip3d_lite.validate import floats
+from tapip3d_lite.queries import near_origin, support_queries
+from tapip3d_lite.validate import checked, floats
 
 
 class Stream:
@@ -47,6 +47,7 @@ class Stream:
         ValueError: queries that are no (N, 4) rows with whole frame numbers, or a bad option.
     """
 
+    @checked
     def __init__(
         self,
         tracker: nn.Module,
@@ -54,7 +55,7 @@ class Stream:
         space: Any = None,
         iterations: int | None = None,
         support_grid: int = 0,
-        depth_roi: tuple[float, float] | None = None,
+        depth_roi: str | tuple[float, float] | None = None,
         visible_threshold: float | None = None,
         watch: Callable[[Step], None] | None = None,
         keep: bool = True,
@@ -73,6 +74,7 @@ class Stream:
         self.support: list[Neighbors] = []
         self.seen, self.length, self.begin = 0, None, 0  # frames pushed; real ones, once finished; of `past`
         self.queries, self.past = np.zeros((0, 4), np.float32), np.zeros((0, 0, 5), np.float32)  # x, y, z, v, visible
+        self.shift = np.zeros(3)  # of the world, once there is a frame
         self.numbers = np.zeros(0, int)  # of the columns: rows of `queries`, or -1 for the support grid's
         self.rows = torch.zeros(1, 0, 4, device=next(tracker.parameters()).device)
         nothing = self.rows.new_zeros(1, tracker.config.window, 0, 3)
@@ -90,7 +92,7 @@ class Stream:
         ValueError for rows as above, or in frames that are forgotten already: the last S / 2 are not.
         """
         self._check_open()
-        rows = floats("queries", queries, (None, 4), finite=True)
+        rows = floats("queries", queries, (None, 4), finite=True, far=True)
         wrong = (rows[:, 0] < self.state.first) | (rows[:, 0] != np.rint(rows[:, 0]))
         if wrong.any():
             raise ValueError(
@@ -98,7 +100,7 @@ class Stream:
             )
         numbers = len(self.queries) + np.arange(len(rows))
         self.queries = np.concatenate([self.queries, rows])
-        self._enter(rows, numbers)
+        self._enter((rows - np.r_[0, self.shift]).astype(np.float32), numbers)
         return numbers
 
     def drop(self, numbers: np.ndarray) -> None:
@@ -134,10 +136,12 @@ class Stream:
         """
         self._check_open()
         clip = Clip(image[None], depth[None], np.asarray(intrinsics)[None], np.asarray(extrinsics)[None])
+        clip, self.shift = near_origin(clip, self.shift if self.seen else None)
         clip = resize_clip(clip, self.tracker.config.image_size, self.tracker.config.as_released)
         frames = frames_from_clip(clip, device=self.rows.device)
         if self.seen == 0:
             self.space = fitted(self.space, frames)
+            self.rows[0] = torch.from_numpy(self.queries[self.numbers] - np.r_[0, self.shift])
             grid = support_queries(clip, self.grid) if self.grid else self.queries[:0]
             self._enter(grid, np.full(len(grid), -1))
         with torch.no_grad():
@@ -214,14 +218,14 @@ class Stream:
         begun = np.arange(first, self.seen)[:, None] >= queries[:, 0]  # there is no pass backward
         visible = visibility(logits, self.threshold, xyz, *seen_by, begun, self.tracker.config)
         future = queries[:, 0] >= self.seen  # known to the world, but not yet to a camera
-        return Tracks(np.where(future[:, None], queries[:, 1:], xyz), visible, queries, logits)
+        return Tracks(np.where(future[:, None], queries[:, 1:], xyz + self.shift), visible, queries, logits)
 
     def _remember(self, tracks: Tracks) -> None:
         """Write a window's tracks over what the one before said; room doubles, so that it is seldom made anew."""
         self.begin = 0 if self.keep else self.state.first
         stop, (length, count), total = self.seen - self.begin, self.past.shape[:2], len(self.queries)
         if not self.keep or stop > length or total > count:
-            room = np.zeros((length if stop <= length else stop * (1 + self.keep), total, 5), np.float32)
+            room = np.zeros((length if stop <= length else stop * (1 + self.keep), total, 5), self.queries.dtype)
             room[..., :3] = self.queries[:, 1:]
             room[: self.keep * length, :count] = self.past[: self.keep * length]
             self.past = room

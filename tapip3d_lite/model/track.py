@@ -24,11 +24,13 @@ from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.config import INTERCHANGEABLE, TrackerConfig
 from tapip3d_lite.model.frames import Frames, crop_clip, frames_from_clip, resize_clip
-from tapip3d_lite.queries import resolve_queries, support_queries
+from tapip3d_lite.queries import near_origin, resolve_queries, support_queries
+from tapip3d_lite.validate import checked
 
 _KEPT = 2**27  # floats of features kept for a whole clip (512 MiB); of longer clips only a window's are
 
 
+@checked
 @torch.no_grad()
 def track(
     tracker: nn.Module,
@@ -77,7 +79,9 @@ def track(
     if size is not None:
         tracker = copy.copy(tracker)  # with the same weights
         tracker.config = tracker.config.replace(image_size=size)
-    queries, count = resolve_queries(clip, queries), len(clip)
+    asked, count = resolve_queries(clip, queries), len(clip)
+    clip, shift = near_origin(clip)
+    queries = (asked - np.r_[0, shift]).astype(np.float32)
     clip = _prepared(clip, tracker.config, crop)
     roi = quantile_roi(torch.from_numpy(clip.depths)) if isinstance(depth_roi, str) else depth_roi
     options = {"iterations": iterations, "space": space, "depth_roi": roi}
@@ -94,7 +98,7 @@ def track(
             logits = np.where(begun, logits, other[1][::-1])
     cameras = clip.intrinsics, clip.extrinsics
     visible = visibility(logits, threshold, xyz, *cameras, bidirectional | begun, tracker.config)
-    return Tracks(xyz[:count], visible[:count], queries, logits[:count])
+    return Tracks(xyz[:count] + shift, visible[:count], asked, logits[:count])
 
 
 def visibility(

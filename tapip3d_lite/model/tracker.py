@@ -30,6 +30,7 @@ from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.stream import Stream
 from tapip3d_lite.model.updater import token_width, trajectory_tokens
 from tapip3d_lite.model.windows import Scene, State, Step, Window, query_support, to_world, window_ends
+from tapip3d_lite.validate import checked
 
 _CHUNK = 2**25  # floats of context tokens that exist at once without gradient: 128 MiB
 _CPU_CHUNK = 2**21  # on a CPU 8 MiB are twice as fast, since temporaries stay in the cache
@@ -49,6 +50,7 @@ class Tracker(nn.Module):
 
     sync_free: bool = False
 
+    @checked
     def __init__(self, config: TrackerConfig, fast: bool = True) -> None:
         super().__init__()
         self.config = config

@@ -22,7 +22,7 @@ from tapip3d_lite.files import atomic_path
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.outline import NoValues
-from tapip3d_lite.validate import check_state
+from tapip3d_lite.validate import check_device, check_state
 
 _FORMAT = "tapip3d_lite"
 
@@ -48,7 +48,7 @@ def save_weights(tracker: Tracker, path: str | Path, half: bool = False) -> None
         temporary.write_bytes(len(header).to_bytes(8, "little") + header + data[end:])
 
 
-def load_weights(path: str | Path, device: str = "cpu", fast: bool = True, parts: Sequence[Any] = ()) -> Tracker:
+def load_weights(path: str | Path, device: Any = "cpu", fast: bool = True, parts: Sequence[Any] = ()) -> Tracker:
     """Read a tracker that `save_weights` wrote, in evaluation mode, to a device; `fast` as for `Tracker`.
 
     Custom parts that the file names must be among `parts`: classes, matched by name, or names of modules to import.
@@ -56,6 +56,7 @@ def load_weights(path: str | Path, device: str = "cpu", fast: bool = True, parts
     Raises:
         ValueError: missing, truncated or foreign file, a part that is not allowed, parameters that do not fit or are NaN.
     """
+    check_device(device)
     state, config = read_weights(path)
     try:
         made = TrackerConfig.from_dict(config, parts)

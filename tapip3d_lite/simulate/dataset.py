@@ -7,6 +7,8 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -49,6 +51,7 @@ def simulate_dataset(
 
     Raises:
         ValueError: bad number, or the folder holds clips of another configuration, or another process writes to it.
+        BrokenProcessPool: as for `run_jobs`; the same call goes on.
     """
     for name, value, low in (("count", count, 1), ("first_seed", first_seed, 0), ("workers", workers or 1, 1)):
         if not isinstance(value, int) or value < low:
@@ -72,14 +75,30 @@ def simulate_dataset(
 def run_jobs(function: Callable[[Any], Any], jobs: Sequence[Any], workers: int | None = None) -> Iterator[Any]:
     """Yield a function's result for each job as it is done: in this process, or by several workers in any order.
 
-    The function stands at the top level of a module, since workers import it. `workers=None` is one per core.
+    The function stands at the top level of a module, since workers import it. `workers=None` is one per core. A job is a
+    tuple that begins with the path that it writes.
+
+    Raises:
+        BrokenProcessPool: a worker was killed or could not start, and which jobs were at work; what was done is kept.
     """
     workers = min(workers or os.cpu_count() or 1, len(jobs))
-    if workers > 1:
-        with multiprocessing.get_context("spawn").Pool(workers, leave_interrupts) as pool:
-            yield from pool.imap_unordered(function, jobs)
-    else:
+    if workers <= 1:
         yield from map(function, jobs)
+        return
+    pool, futures = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), leave_interrupts), {}
+    try:
+        for job in jobs:  # begun in this order
+            futures[pool.submit(function, job)] = job[0].stem
+        for future in as_completed(list(futures)):
+            yield future.result()
+            del futures[future]
+    except BrokenProcessPool:
+        raise BrokenProcessPool(
+            f"a worker process ended at work on {', '.join([*futures.values()][:workers])}: killed, e.g. for lack of memory (use "
+            'fewer workers), or unable to start (a script needs `if __name__ == "__main__":`); what was done is kept, try again'
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)  # after those at work
 
 
 def leave_interrupts(worker: int = 0) -> None:

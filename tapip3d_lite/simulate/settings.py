@@ -76,6 +76,8 @@ class SimulationConfig:
         self._require("fps speed drop", lambda v: _number(v) and v > 0, "a positive number", "1 is the usual scale")
         self._require("handheld stereo_baseline", lambda v: _number(v) and v >= 0, "a number of at least 0", "0 is off")
         self._require("share_dynamic", lambda v: _number(v) and 0 <= v <= 1, "a fraction in [0, 1]", "0.6 means 60 %")
+        switches = "sky same_texture occluder motion_blur"
+        self._require(switches, lambda v: isinstance(v, bool | np.bool_), "True or False", "change it")
         self._require("camera", lambda v: v in CAMERAS, f"one of {', '.join(CAMERAS)}", "choose one of them")
         unknown = [shape for shape in self.shapes if shape not in SHAPES]
         self._require("shapes", lambda v: v and not unknown, f"some of {', '.join(SHAPES)}", f"drop {unknown}")

@@ -240,7 +240,8 @@ def make_batch(clips: list[Clip], features: list[Tensor] | None = None, iteratio
     """
 
     def stack(arrays: Iterable[np.ndarray]) -> Tensor:
-        return torch.from_numpy(np.stack(list(arrays)))
+        array = np.stack(list(arrays))
+        return torch.from_numpy(array.astype(np.float32) if array.dtype == np.float64 else array)
 
     tracks, names = [clip.tracks for clip in clips], tuple(clip.name for clip in clips)
     frames = [stack(getattr(clip, x) for clip in clips) for x in ("video", "depths", "intrinsics", "extrinsics")]

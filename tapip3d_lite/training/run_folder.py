@@ -114,13 +114,20 @@ class Bar(tqdm):
 
 
 def read_log(path: str | Path) -> list[dict[str, Any]]:
-    """The lines of a `log.jsonl`, or of the one in a folder, without a half-written last line; none is a ValueError."""
+    """The lines of a `log.jsonl`, or of the one in a folder, without a half-written last one; ValueError: there is none."""
     path = Path(path)
     path = path / "log.jsonl" if path.is_dir() else path
     if not path.exists():
         raise ValueError(f"{path}: no such log; give the folder of a training")
-    lines = []
-    for text in path.read_text(encoding="utf-8").splitlines():
+    *texts, last = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    try:
+        lines = [json.loads(text) for text in texts]
         with contextlib.suppress(json.JSONDecodeError):
-            lines.append(json.loads(text))
+            lines.append(json.loads(last))
+        for line in lines:
+            numbers = [line["step"] + line["seconds"], *(x for key, x in line.items() if key != "stage")]
+            if not all(isinstance(x, int | float | None) for x in numbers) or not isinstance(line["stage"], str):
+                raise ValueError(f"a line holds {line}"[:200])
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path}: no log of a training ({error}); give the folder of one") from error
     return lines
