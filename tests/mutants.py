@@ -42,7 +42,7 @@ def mutants(source):
             change(target)
             text = ast.unparse(ast.fix_missing_locations(changed))
             if text != ast.unparse(tree):
-                yield f"{node.lineno}:{node.col_offset} {what}", text
+                yield f"{getattr(node, 'lineno', 0)}:{getattr(node, 'col_offset', 0)} {what}", text
 
 
 def _changes(node):
