@@ -245,6 +245,8 @@ def lab(
     against: Annotated[str | None, arg(help="the row that others are compared with")] = None,
     metric: Annotated[tuple[str, ...], arg(help="that judge, the first one first")] = JUDGED,
     out: Annotated[Path, arg(help="folder (report)")] = Path("report"),
+    budget: Annotated[str | None, arg(help="in place of the study's own: lab, tiny (seconds a row) or shipped")] = None,
+    seeds: Annotated[int | None, arg(help="trainings of each row, in place of the study's own number")] = None,
     accept_code: Annotated[bool, arg(help="go on with results of other code")] = False,
     allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
@@ -252,9 +254,9 @@ def lab(
     from tapip3d_lite.lab.papers import TABLES, listed, open_study
 
     if study is None:
-        print("\n".join(f"{name}: {', '.join(values['rows'])}" for name, values in TABLES.items()))
+        print("\n".join(f"{name}: {' · '.join(values['rows'])}" for name, values in TABLES.items()))
         return
-    opened, base = open_study(study, accept_code, allow)
+    opened, base = open_study(study, accept_code, allow, budget, seeds)
     if action == "run" and not opened.run(jobs, device):
         print("stopped and saved; the same command goes on")
         sys.exit(130)

@@ -14,10 +14,14 @@ from matplotlib.figure import Figure
 from safetensors.torch import load_file
 
 from tapip3d_lite import __main__, lab
+from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.geometry import project, unproject
 from tapip3d_lite.lab import jobs, plan
 from tapip3d_lite.lab.budgets import judged_clip
+from tapip3d_lite.lab.claims import judge, with_claims
 from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.lab.papers import TABLES, open_study
+from tapip3d_lite.lab.table import compare
 from tapip3d_lite.training.data import FeatureCache
 from tapip3d_lite.training.examples import Examples
 from tapip3d_lite.training.loss import LossConfig
@@ -119,6 +123,23 @@ def test_conditions_are_alike_for_all_rows(study):
     np.testing.assert_array_equal(made.depths, under(clip, {"frozen": "depths", "poses": 2.0, "grain": 0.01}, 1).depths)
     np.testing.assert_array_equal(under(clip, "tests.lab_conditions:darker", 1).video, clip.video // 3)
     assert under(clip, None, 1) is clip
+
+
+def test_points_at_silhouettes_lie_beside_steps_of_depth():
+    depth = np.tile(1 / np.linspace(0.6, 0.2, 32, dtype=np.float32)[:, None], (1, 40))  # a floor, straight in 1 / z
+    depth[8:20, 10:22] = 1.2
+    k = np.array([[40, 0, 20], [0, 40, 16], [0, 0, 1]], np.float32)
+    uv = np.stack(np.meshgrid(np.arange(1, 39, 3), np.arange(1, 31, 3)), -1).reshape(-1, 2)
+    xyz = unproject(uv.astype(np.float32), depth[uv[:, 1], uv[:, 0]], k)
+    queries = np.concatenate([np.zeros((len(uv), 1)), xyz], 1).astype(np.float32)
+    tracks = Tracks(np.repeat(xyz[None], 2, 0), np.ones((2, len(uv)), bool), queries)
+    cameras = np.repeat(k[None], 2, 0), np.repeat(np.eye(4, dtype=np.float32)[None], 2, 0)
+    clip = Clip(np.zeros((2, 32, 40, 3), np.uint8), np.stack([depth, depth]), *cameras, queries, tracks)
+    made = under(clip, {"silhouettes": 0.2}, 0)
+    assert len(made.queries) == len(made.tracks.queries) == round(0.2 * len(uv)) and (made.depths == clip.depths).all()
+    column, row = project(made.queries[:, 1:], k)[0].T
+    sides = [np.abs(column - 9.5), np.abs(column - 21.5), np.abs(row - 7.5), np.abs(row - 19.5)]
+    assert np.min(sides, 0).max() < 3 and ((column > 6) & (column < 25) & (row > 4) & (row < 23)).all()
 
 
 # --- equal conditions ---------------------------------------------------------------------------------------------------
@@ -423,10 +444,75 @@ def test_from_a_toml_file_to_the_table(store, tmp_path, monkeypatch, capsys):
 
 def test_the_tables_of_the_paper_have_names(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert "n2n: n2n, p2n" in call(monkeypatch, capsys, "list")
+    assert "n2n: n2n, world · p2n, world · n2n, camera" in call(monkeypatch, capsys, "list")
+    shared = set()
     for name in TABLES:
         made, against = open_study(name)
         assert against in made.plan.rows and str(made.plan.store) == "runs/store"
+        recipes = [row.recipe(made.plan.budget.recipe) for row in made.plan.rows.values() if row.given is None]
+        if paper := made.paper:
+            assert set(paper["rows"]) <= set(made.plan.rows) and all(len(x) == 3 for x in paper["rows"].values())
+            assert {row for pair in paper["pairs"] for row in pair} <= set(paper["rows"])
+        shared |= {json.dumps(recipe.to_dict(), sort_keys=True) for recipe in recipes}
+        assert all(row.given == "lite" for row in made.plan.rows.values()) == (
+            made.plan.budget == lab.BUDGETS["shipped"]
+        )
+    assert len(shared) == 14  # trainings of a seed, of 43 rows
+
+
+@pytest.fixture(scope="module")
+def home(study, tmp_path_factory):
+    """A folder whose `runs/store` has clips, the encoder and what tables train."""
+    folder = tmp_path_factory.mktemp("tables")
+    shutil.copytree(study.plan.store, folder / "runs/store")
+    return folder
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_table_of_the_paper_runs(name, home, monkeypatch, capsys):
+    monkeypatch.chdir(home)
+    monkeypatch.setitem(lab.BUDGETS, "tiny", replace(TINY, held_out=2, frames=4, points=8))
+    text = call(monkeypatch, capsys, "run", name, "--budget", "tiny", "--seeds", "1")
+    assert "failed" not in text and all(f"\n| {row} | " in text for row in TABLES[name]["rows"])
+    paper = TABLES[name].get("paper")
+    if paper:
+        assert paper["source"] in text
+        one, other = paper["pairs"][0]
+        assert f"| {one} minus {other} | APD3D, moving points | " in text
+        numbers = paper["rows"][one]
+        assert f"| {one} | {' / '.join('–' if x is None else f'{x:.1f}' for x in numbers)} |" in text
+    values = json.loads((home / f"runs/{name}, tiny/study.json").read_text())
+    assert values["seeds"] == 1 and values["budget"]["held_out"] == 2
+
+
+def scored(level, trained=True, seeds=3):
+    """Results of a row whose clips and seeds differ a little."""
+    rng = np.random.default_rng(0)
+    return {
+        s: {
+            "training": trained or None,
+            "costs": {},
+            "scores": {f"c{i}": {"APD3D_none": level + 0.01 * rng.normal(), "OA": level} for i in range(20)},
+        }
+        for s in range(seeds)
+    }
+
+
+def test_claims_of_the_paper_are_judged_by_their_sign():
+    results = {"good": scored(0.6), "bad": scored(0.3), "same": scored(0.6), "unknown": scored(0.1)}
+    results["good"][0]["scores"]["c0"]["APD3D_none"] += 0.05  # so that it differs from "same", by nothing
+    numbers = {"good": (50, 60, None), "bad": (40, 50, 70), "same": (30, 70, 70), "unknown": (None, None, None)}
+    pairs = [("bad", "good"), ("same", "bad"), ("same", "good"), ("unknown", "good"), ("bad", "same")]
+    paper = {"source": "here", "rows": numbers, "pairs": pairs}
+    found = judge(results, paper, ["APD3D_none", "OA"])
+    said = {(x["row"], x["against"], x["metric"]): x["verdict"] for x in found}
+    assert said[("bad", "good", "APD3D_none")] == "agree" and said[("same", "good", "APD3D_none")] == "undecided"
+    assert ("unknown", "good", "APD3D_none") not in said and ("bad", "good", "OA") not in said
+    assert said[("bad", "same", "OA")] == "undecided"  # the paper's numbers are equal
+    turned = {**paper, "rows": numbers | {"bad": (40, 90, 70)}}
+    assert judge(results, turned, ["APD3D_none"])[0]["verdict"] == "disagree"
+    table = with_claims(compare(results, "good", ["APD3D_none"]), results, paper)
+    assert "| bad minus good | APD3D_none | -10.0 | -30." in str(table) and table.to_dict()["claims"][0]["row"] == "bad"
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,7 @@ _PARTS = {
     "loss, training": ("06", 7, 1.5),
     "scores\nAJ, APD, OA": ("07", 7, -0.6),
 }
+_ALSO = {"09": ("03", "04", "05", "06")}  # a lesson about the parts of others
 _ARROWS = [(0, 1), (0, 2), (2, 3), (1, 4), (3, 4), (4, 5), (5, 6), (6, 7), (7, 8), (8, 9), (8, 10)]
 
 
@@ -75,7 +76,7 @@ def image(figure: Figure, alt: str) -> str:
 
 
 def pipeline(lesson: str) -> Shown:
-    """The method as a map, from RGB-D frames to tracks, with the part of a lesson (`"00"` to `"07"`) lit."""
+    """The method as a map, from RGB-D frames to tracks, with the part of a lesson (`"00"` to `"09"`) lit."""
     names = list(_PARTS)
     figure = Figure(figsize=(10.2, 2.3), layout="constrained")
     ax = figure.subplots()
@@ -90,9 +91,9 @@ def pipeline(lesson: str) -> Shown:
         ax.add_patch(FancyArrowPatch(start, end, **line))
     ax.add_patch(FancyArrowPatch((6, 0.76), (4, 0.76), connectionstyle="arc3,rad=0.3", **line))
     ax.text(5, 1.42, "with the new estimate", ha="center", fontsize=8, color="#57606a")
-    lit = [name for name, (number, *_) in _PARTS.items() if number == lesson]
+    lit = [name for name, (number, *_) in _PARTS.items() if number in _ALSO.get(lesson, (lesson,))]
     for name, (number, x, y) in _PARTS.items():
-        on = number == lesson
+        on = name in lit
         ax.add_patch(FancyBboxPatch((x - 0.42, y - 0.22), 0.84, 0.44, boxstyle="round,pad=0.02,rounding_size=0.08",
                                     fc=_LIT if on else _PALE, ec=_INK, lw=1.6 if on else 0.6, zorder=2))  # fmt: skip
         ax.text(x, y, name, ha="center", va="center", fontsize=8.5, color=_INK, zorder=3)

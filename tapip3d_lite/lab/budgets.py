@@ -33,6 +33,11 @@ def tiny_scene(seed: int) -> SimulationConfig:
     return replace(lab_scene(seed), frames=8, size=(32, 32), tracks=48)
 
 
+def shipped_scene(seed: int) -> SimulationConfig:
+    """What `lite` is judged by without a training: 128 x 128 pixels, and a camera that moves."""
+    return SimulationConfig(frames=16, tracks=128, camera=("arc", "linear", "handheld")[seed % 3])
+
+
 @dataclass(frozen=True)
 class Budget:
     """What is equal in all rows of a study.
@@ -93,6 +98,8 @@ _TINY_STEPS = {
 BUDGETS = {
     "lab": Budget(TrainConfig(tracker=_LAB, **_LAB_STEPS, **_FOCUSED)),
     "tiny": Budget(TrainConfig(tracker=_TINY, **_TINY_STEPS, **_FOCUSED), tiny_scene, held_out=4, frames=6, points=12),
+    # For rows that are not trained.
+    "shipped": Budget(TrainConfig(clips=1, validation=0), shipped_scene, held_out=24, frames=16),
 }
 
 

@@ -6,13 +6,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.geometry import project
 from tapip3d_lite.parts import import_part
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade, wrong_poses
 from tapip3d_lite.validate import check_names
 
+_EDGE = 0.1  # of 1 / z: how far it may bend within a surface
 _SENSOR = {field.name for field in fields(SensorConfig)}
 
 
@@ -31,7 +34,21 @@ def poses(clip: Clip, degrees: float, seed: int) -> Clip:
     return wrong_poses(clip, degrees, seed, drift=0.0)
 
 
-CONDITIONS: dict[str, Callable[[Clip, Any, int], Clip]] = {"grey": grey, "frozen": frozen, "poses": poses}
+def silhouettes(clip: Clip, share: float, _seed: int) -> Clip:
+    """Only the share of the points that frame 0 shows nearest to a silhouette is asked for, and judged."""
+    depth = np.maximum(clip.depths[0], 1e-3)
+    bent = np.abs(cv2.Laplacian(1 / depth, cv2.CV_32F)) * depth > _EDGE  # 1 / z is straight on planes
+    away = cv2.distanceTransform((~bent).astype(np.uint8), cv2.DIST_L2, 3)
+    uv, _ = project(clip.queries[:, 1:], clip.intrinsics[0], clip.extrinsics[0])
+    column, row = np.rint(uv).clip(0, np.array(depth.shape[::-1]) - 1).astype(int).T
+    near = np.argsort(away[row, column], kind="stable")[: max(1, round(share * len(uv)))]
+    tracks = clip.tracks.select(near)
+    return replace(clip, queries=tracks.queries, tracks=tracks)
+
+
+CONDITIONS: dict[str, Callable[[Clip, Any, int], Clip]] = {
+    "grey": grey, "frozen": frozen, "poses": poses, "silhouettes": silhouettes
+}  # fmt: skip
 """Beside them the fields of `SensorConfig`, e.g. `{"blur": 1.5}` or `{"grain": 0.003, "shadow": 2.0}`."""
 
 

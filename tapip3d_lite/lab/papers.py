@@ -12,30 +12,156 @@ from tapip3d_lite.lab.study import Study
 from tapip3d_lite.lab.variant import Variant
 from tapip3d_lite.validate import check_names
 
+
+def _table(
+    source: str, rows: Mapping[str, tuple], pairs: Sequence[tuple[str, str]] | None = None, **rest: Any
+) -> dict[str, Any]:
+    """Each row with its arguments and maybe the paper's numbers; without pairs all these are compared with the first."""
+    (first, *others), numbers = rows, {name: one[1] for name, one in rows.items() if one[1:]}
+    pairs = [(name, first) for name in others if name in numbers] if pairs is None else pairs
+    paper = {"paper": {"source": source, "rows": numbers, "pairs": pairs}} if numbers else {}
+    return {"rows": {name: one[0] for name, one in rows.items()}, "against": first, **paper, **rest}
+
+
+def _of_lite(source: str, rows: Mapping[str, tuple], pairs: Sequence[tuple[str, str]] | None = None) -> dict[str, Any]:
+    """A table without training: `lite` with options of `track` and conditions."""
+    given = {name: ({"tracker": "lite", **one[0]}, *one[1:]) for name, one in rows.items()}
+    return _table(source, given, pairs, budget="shipped")
+
+
+_CAMERA, _WINDOW, _P2N = {"space": "camera"}, {"neighborhood": "window"}, {"context": "p2n"}
+_BOTH = {"motion": {"world": 0.5, "still": 1.0}}  # half of the examples in the world's frame, half in the camera's
+_MATCHED = {**_WINDOW, "context": "correlation"}
+_SENSOR = {
+    "degrade": {
+        "flicker": 0.01, "noise": 0.01, "grain": 0.002, "step": 0.001, "flying": 0.5, "shadow": 1.5, "dropout": 0.05
+    }
+}  # fmt: skip
+_EDGES = {"degrade": {"silhouettes": 0.25}}
+_NEAREST, _FIXED = (29.8, 51.6, 70.9), (27.7, 50.0, 67.7)
+_SYSTEMS: dict[str, tuple] = {  # with the numbers of LSFOdyssey and of DexYCB
+    "TAPIP3D, world": ({}, (72.2, 85.8, None), (30.3, 52.4, 71.3)),
+    "TAPIP3D, camera": (_CAMERA, (68.3, 83.2, None)),
+    "DELTA-like": ({"space": "uvlogd", "depth_ratio": True, **_MATCHED}, (37.7, 50.1, None), (26.4, 43.3, 72.8)),
+    "CoTracker3-like, lifted": ({"space": "uv", **_MATCHED}, (28.4, 35.0, None), (14.9, 26.1, 70.9)),
+    "SpatialTracker-like": (
+        {"space": "uvd", "neighborhood": "planes", "context": "planes"}, (8.2, 13.3, None), (5.5, 11.4, 66.8)
+    ),
+    "SceneTracker-like": ({"space": "uvd", "depth_ratio": True, **_MATCHED},),
+    **{name: ({"tracker": name},) for name in ("static", "klt", "lite")},
+}  # fmt: skip
+
 TABLES: dict[str, dict[str, Any]] = {
-    "n2n": {"rows": {"n2n": {}, "p2n": {"context": "p2n"}}, "against": "n2n"},
-}
-"""The paper's tables: `rows` by name, each with the arguments of `Variant`; `against`, and other arguments of `Study`."""
+    "coordinates": _table(
+        "coordinates, LSFOdyssey, true depth; camera and world are one checkpoint there; uv has no row",
+        {
+            "world": ({}, (70.7, 84.1, 86.6)), "camera": (_CAMERA, (67.1, 81.6, 85.8)),
+            "uvlogd": ({"space": "uvlogd"}, (62.9, 77.9, 84.1)), "uvd": ({"space": "uvd"}, (63.4, 77.0, 87.0)),
+            "uv": ({"space": "uv"},), "world of both": (_BOTH, (70.7, 84.1, 86.6)),
+            "camera of both": ({**_BOTH, "track": _CAMERA}, (67.1, 81.6, 85.8)),
+        },
+        [
+            ("camera", "world"), ("camera of both", "world of both"),
+            *((one, other) for other in ("world", "camera") for one in ("uvlogd", "uvd")),
+        ],
+    ),
+    "n2n": _table(
+        "N2N, LSFOdyssey, true depth; p2n is its row without N2N",
+        {
+            "n2n, world": ({}, (70.7, 84.1, 86.6)), "p2n, world": (_P2N, (62.1, 75.1, 88.2)),
+            "n2n, camera": (_CAMERA, (67.1, 81.6, 85.8)), "p2n, camera": ({**_P2N, **_CAMERA}, (59.4, 72.7, 88.0)),
+        },
+        [(f"p2n, {space}", f"n2n, {space}") for space in ("world", "camera")],
+    ),
+    "neighbours": _table(
+        "neighbours, DexYCB, a sensor's depth; its one pair of rows stands beside each of ours",
+        {
+            f"{name}, {where}": ({**part, **under}, numbers)
+            for where, under in {"world": {}, "camera": _CAMERA, "sensor": _SENSOR, "silhouettes": _EDGES}.items()
+            for name, part, numbers in (("k-NN", {}, _NEAREST), ("window", _WINDOW, _FIXED))
+        },
+        [(f"window, {where}", f"k-NN, {where}") for where in ("world", "camera", "sensor", "silhouettes")],
+    ),
+    "systems": _table(
+        "main table, LSFOdyssey, true depth; without SceneTracker and OA",
+        {name: one[:2] for name, one in _SYSTEMS.items()},
+    ),
+    "systems-sensor": _table(
+        "main table, DexYCB, a sensor's depth; without SceneTracker and camera space",
+        {name: ({**one[0], **_SENSOR}, *one[2:]) for name, one in _SYSTEMS.items()},
+    ),
+    "K": _of_lite(
+        "K at test, LSFOdyssey; 32, 16, 24, 48 of a training with 32 beside 9, 4, 7, 13 of one with 9",
+        {
+            f"K = {k}": ({"track": {"neighbors": k}}, *numbers) for k, *numbers in (
+                (9, (72.2, 85.8, 86.9)), (4, (67.9, 84.5, 83.6)), (7, (71.1, 85.8, 85.9)), (13, (72.6, 85.3, 88.6)),
+                (18,), (32,), (48,),
+            )
+        },
+    ),
+    "pose-noise": _of_lite(
+        "pose noise, LSFOdyssey; camera space does not see it",
+        {
+            **{
+                f"{x:g}°": ({"degrade": {"poses": x}}, *numbers) for x, *numbers in (
+                    (0.0, (72.2, 85.8, 86.9)), (0.25,), (0.5, (70.4, 84.6, 86.8)), (1.0, (67.8, 82.7, 86.4)),
+                    (2.0, (64.9, 80.3, 85.7)), (4.0,),
+                )
+            },
+            "camera": ({"track": _CAMERA}, (68.3, 83.2, 86.2)),
+        },
+        [("0.5°", "0°"), ("1°", "0°"), ("2°", "0°"), ("1°", "camera"), ("2°", "camera")],
+    ),
+    "blur": _of_lite(
+        "blur, estimated depth, which suffers from it there; ours stays true",
+        {
+            f"blur {x:g}": ({"degrade": {"blur": x}}, (None, apd, None))
+            for x, apd in ((0.0, 29.2), (0.5, 21.2), (1.0, 20.6), (2.0, 18.1))
+        },
+    ),
+    "depth": _of_lite(
+        "",
+        {
+            name: ({"degrade": flaws},) for name, flaws in {
+                "true": {}, "1 % noise": {"noise": 0.01}, "5 % noise": {"noise": 0.05}, "2 % flicker": {"flicker": 0.02},
+                "mixed at silhouettes": {"flying": 0.5, "shadow": 1.5}, "half missing": {"dropout": 0.5},
+                "sensor-like": _SENSOR["degrade"],
+            }.items()
+        },
+    ),
+    "iterations": _of_lite("", {f"M = {m}": ({"track": {"iterations": m}},) for m in (3, 1, 2, 4, 6, 8)}),
+    "image-size": _of_lite("", {f"{x} pixels": ({"track": {"size": (x, x)}},) for x in (128, 64, 96, 192, 256)}),
+}  # fmt: skip
+"""The paper's tables: `rows` by name, each with the arguments of `Variant`; `against`, `paper` (see `claims.with_claims`),
+and other arguments of `Study`. The paper's numbers are AJ3D, APD3D and OA; a row whose numbers are not at hand has none."""
 
 _FIELDS = ("folder", "rows", "against", "seeds", "budget", "steps", "minutes", "store")
 
 
-def open_study(source: str | Path, accept_code: bool = False, parts: Sequence[Any] = ()) -> tuple[Study, str | None]:
+def open_study(
+    source: str | Path,
+    accept_code: bool = False,
+    parts: Sequence[Any] = (),
+    budget: str | None = None,
+    seeds: int | None = None,
+) -> tuple[Study, str | None]:
     """A study, and the row that others are compared with, from a name of `TABLES`, a TOML or JSON file, or a folder.
 
     A file's `folder` and `store` are relative to it; without a `folder` the study is in `runs/<name>`. Custom parts that
-    files name must be among `parts`, as for `load_tracker`.
+    files name must be among `parts`, as for `load_tracker`. Another `budget` (which gets a folder of its own) or number
+    of `seeds` than the study's can be asked for.
 
     Raises:
         ValueError: neither of these, an unreadable file, unknown fields, or what `Study` refuses.
     """
-    path = Path(source)
+    path, paper = Path(source), None
     if (path / "study.json").exists():
-        return Study(path, accept_code=accept_code, parts=parts), None
+        return Study(path, seeds=seeds, budget=budget, accept_code=accept_code, parts=parts), None
     if path.suffix not in (".toml", ".json"):
         check_names("lab: no file (.toml, .json), no study's folder, no table of the paper", [str(source)], TABLES)
         values, home = TABLES[str(source)], Path()
         values = {"store": "runs/store", **values}
+        paper = values.pop("paper", None)
     else:
         values, home = _parsed(path), path.parent
     check_names(str(source), values, _FIELDS)
@@ -47,7 +173,12 @@ def open_study(source: str | Path, accept_code: bool = False, parts: Sequence[An
         kept["store"] = home / values["store"]
     folder = home / values.get("folder", Path("runs") / path.stem)
     rows = [Variant.from_dict(name, row, parts) for name, row in rows.items()]
+    if budget is not None:
+        kept, folder = {**kept, "budget": budget}, folder.with_name(f"{folder.name}, {budget}")
+    if seeds is not None:
+        kept["seeds"] = seeds
     study = Study(folder, rows, **kept, accept_code=accept_code, parts=parts)
+    study.paper = paper
     return study, values.get("against")
 
 

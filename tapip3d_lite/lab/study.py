@@ -22,6 +22,7 @@ from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures.comparisons import where_they_differ
 from tapip3d_lite.files import read_json, write_text
 from tapip3d_lite.lab.budgets import BUDGETS, Budget, Data, judged_clip
+from tapip3d_lite.lab.claims import with_claims
 from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.lab.jobs import STOPPED, Job, do_all, tracker_of
 from tapip3d_lite.lab.plan import Plan, is_scored
@@ -92,6 +93,7 @@ class Study:
         self.plan = Plan(folder, store, dict(zip(names, rows, strict=True)), seeds, budget)
         self.plan.check_rows()
         self._data: Data | None = None
+        self.paper: dict[str, Any] | None = None  # what it says of these rows, see `claims`
         if old is not None:
             self.plan.take_over(old, accept_code)
 
@@ -149,7 +151,9 @@ class Study:
             ValueError: an unknown row or metric, or no results yet.
         """
         metrics = (metric,) if isinstance(metric, str) else tuple(metric)
-        return compare(self.results(), against or next(iter(self.plan.rows)), metrics)
+        results = self.results()
+        table = compare(results, against or next(iter(self.plan.rows)), metrics)
+        return with_claims(table, results, self.paper) if self.paper else table
 
     def report(self, folder: str | Path, against: str | None = None) -> Path:
         """Write the table, curves, intervals, costs and worst clips as Markdown with figures (PNG), and all as JSON.

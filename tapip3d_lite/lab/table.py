@@ -16,7 +16,7 @@ from tapip3d_lite.validate import check_names
 JUDGED = ("APD3D_none_dynamic", "AJ3D_none")  # first, second
 Results = Mapping[str, Mapping[int, Mapping[str, Any]]]  # row → seed → what its file holds
 Seeds = Mapping[int, Mapping[str, Any]]
-_TITLES = {"APD3D_none_dynamic": "APD3D, moving points", "AJ3D_none": "AJ3D"}
+TITLES = {"APD3D_none_dynamic": "APD3D, moving points", "AJ3D_none": "AJ3D"}
 _COSTS = {  # title, unit, digits
     "parameters": ("parameters (M)", 1e6, 3),
     "multiply_adds": ("multiply-adds (M)", 1e6, 3),
@@ -34,17 +34,19 @@ class Table:
         against: the row that the others are compared with.
         metrics: in the order in which they judge.
         notes: what a reader must know beside the numbers.
+        claims: the paper's, see `claims.judge`.
     """
 
     rows: list[dict[str, Any]]
     against: str
     metrics: tuple[str, ...]
     notes: list[str] = field(default_factory=list)
+    claims: list[dict[str, Any]] = field(default_factory=list)
 
     def __str__(self) -> str:
         head, last = ["row", "seeds"], ["smallest difference that each comparison would see", ""]
         for metric in self.metrics:
-            head += [_TITLES.get(metric, metric), f"minus {self.against}", "verdict"]
+            head += [TITLES.get(metric, metric), f"minus {self.against}", "verdict"]
             seen = [row[metric]["difference"]["seen"] for row in self.rows if "difference" in row[metric]]
             seen = [x for x in seen if not math.isnan(x)]
             last += ["", f"{max(seen):.3f}" if seen else "–", ""]
@@ -56,11 +58,11 @@ class Table:
         return str(self)
 
     def _cells(self, row: dict[str, Any]) -> list[str]:
-        shown = [row["row"], "–" if row["seeds"] is None else str(row["seeds"])]
+        cells = [row["row"], "–" if row["seeds"] is None else str(row["seeds"])]
         for one in (row[metric] for metric in self.metrics):
-            shown += [_interval(one), _interval(one.get("difference"), "+"), one.get("verdict", "")]
+            cells += [shown(one), shown(one.get("difference"), "+"), one.get("verdict", "")]
         costs = [(row[name], unit, digits) for name, (_, unit, digits) in _COSTS.items()]
-        return shown + ["–" if x is None else f"{x / unit:.{digits}f}" for x, unit, digits in costs]
+        return cells + ["–" if x is None else f"{x / unit:.{digits}f}" for x, unit, digits in costs]
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in plain values; NaN as None."""
@@ -88,16 +90,22 @@ def compare(results: Results, against: str, metrics: Sequence[str]) -> Table:
     for name, seeds in scored.items():
         failed = next((x["failed"] for x in results[name].values() if "failed" in x), None)
         rows.append({"row": name, "seeds": len(seeds) if _drawn(seeds) else None, "failed": failed, **_costs(seeds)})
-        ours, theirs = _common(seeds, base)
         for metric in metrics:
             rows[-1][metric] = asdict(effect(_matrix(seeds, metric), _drawn(seeds)) if seeds else Effect(math.nan))
-            if name != against and ours:
-                both = _matrix(seeds, metric, ours), _matrix(base, metric, theirs)
+            if name != against and (found := difference(seeds, base, metric)):
                 compared.append(rows[-1][metric])
-                effects.append(paired(*both, _drawn(seeds) or _drawn(base)))
-    for one, difference, verdict in zip(compared, effects, verdicts(effects), strict=True):
-        one |= {"difference": asdict(difference), "verdict": verdict}
+                effects.append(found)
+    for one, found, verdict in zip(compared, effects, verdicts(effects), strict=True):
+        one |= {"difference": asdict(found), "verdict": verdict}
     return Table(rows, against, tuple(metrics), _notes(rows, results, against))
+
+
+def difference(ours: Seeds, theirs: Seeds, metric: str) -> Effect | None:
+    """The mean of one row's scores minus another's, paired by clip and common seed; None where there is none."""
+    ours, theirs = _scored(ours), _scored(theirs)
+    one, other = _common(ours, theirs)
+    drawn = _drawn(ours) or _drawn(theirs)
+    return paired(_matrix(ours, metric, one), _matrix(theirs, metric, other), drawn) if one else None
 
 
 def gaps_by_clip(
@@ -161,11 +169,12 @@ def _notes(rows: Sequence[dict[str, Any]], results: Results, against: str) -> li
     ]
 
 
-def _interval(one: Mapping[str, float] | None, sign: str = "") -> str:
+def shown(one: Mapping[str, float] | None, sign: str = "", digits: int = 3) -> str:
+    """`mean [low, high]`; a dash where it is undefined."""
     if one is None or math.isnan(one["mean"]):
         return "" if one is None else "–"
-    bounds = "" if math.isnan(one["low"]) else f" [{one['low']:{sign}.3f}, {one['high']:{sign}.3f}]"
-    return f"{one['mean']:{sign}.3f}{bounds}"
+    bounds = "" if math.isnan(one["low"]) else f" [{one['low']:{sign}.{digits}f}, {one['high']:{sign}.{digits}f}]"
+    return f"{one['mean']:{sign}.{digits}f}{bounds}"
 
 
 def _without_nan(value: Any) -> Any:

@@ -99,7 +99,7 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
     `truth` has all frames and tracks of the batch. Frames before the query, padded frames (repetitions of the last one)
     and inactive tracks, which only fill up the batch, do not count.
     """
-    target, visible, counted, depth, focal = _compared(step, truth)
+    target, visible, counted, depth, focal = compared(step, truth)
     depth = depth.clamp(min=0.1)
     pixels = (step.xyz - target).square().sum(-1).add(1e-12).sqrt() / depth * focal
     if config.within:
@@ -125,7 +125,7 @@ def step_accuracy(step: Step, truth: Truth, dynamic: Tensor) -> Tensor:
     Returns:
         (2, 2), sums over points of (this share, 1), for (all, dynamic) points, of which `dynamic` (B, N) is the mask.
     """
-    target, visible, counted, depth, focal = _compared(step, truth)
+    target, visible, counted, depth, focal = compared(step, truth)
     counted = counted & visible
     raster = RASTER / min(step.scene.frames.size)
     pixels = (step.xyz - target).norm(dim=-1) / depth.clamp(min=1e-6) * (focal * raster)
@@ -140,7 +140,7 @@ def accuracy(totals: Tensor) -> dict[str, float | None]:
     return {name: part / count if count else None for name, part, count in zip(names, inside, counted, strict=True)}
 
 
-def _compared(step: Step, truth: Truth) -> tuple[Tensor, ...]:
+def compared(step: Step, truth: Truth) -> tuple[Tensor, ...]:
     """True positions (B, S, n, 3) and visibility (B, S, n) of a window, which of them count, depths, focal lengths (B, S, 1)."""
     frames, last = step.scene.frames, truth.xyz.shape[1] - 1
     index = torch.arange(step.start, step.start + len(frames), device=step.coords.device)

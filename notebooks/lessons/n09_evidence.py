@@ -1,0 +1,98 @@
+"""Lesson 09: a claim about one row of a study on one page, with its setting, its numbers, and what would refute it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tapip3d_lite.evaluation.evaluate import markdown_table
+from tapip3d_lite.files import digest, write_text
+from tapip3d_lite.lab import Study
+from tapip3d_lite.lab.table import TITLES, gaps_by_clip, shown
+
+_WORDS = {
+    "better": "supported",
+    "worse": "refuted: the difference has the other sign",
+    "undecided": "undecided: the interval holds 0",
+}
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A page of Markdown; a notebook shows it as text.
+
+    Attributes:
+        text: the page.
+        verdict: `"supported"`, `"refuted: …"` or `"undecided: …"`.
+        path: where it was written.
+    """
+
+    text: str
+    verdict: str
+    path: Path
+
+    def _repr_markdown_(self) -> str:
+        return self.text
+
+
+def evidence(study: Study, row: str, against: str, claim: str, refuted_by: Sequence[str], path: str | Path) -> Evidence:
+    """Write what a study says about the claim that a row is better than another one.
+
+    Every number is read from the study; the words alone are the caller's.
+
+    Args:
+        study: run, with scores of both rows.
+        row, against: the row that the claim is about, and the one that it is compared with.
+        claim: one sentence.
+        refuted_by: what would show that it is wrong; at least one sentence.
+        path: of the page.
+
+    Raises:
+        ValueError: no sentence that would refute the claim, or what `Study.table` refuses.
+    """
+    if not claim.strip() or not [sentence for sentence in refuted_by if sentence.strip()]:
+        raise ValueError("evidence: a claim that nothing could refute says nothing; name what would")
+    table, results, plan = study.table(against), study.results(), study.plan
+    found = {one["row"]: one for one in table.rows}
+    first = table.metrics[0]
+    if "verdict" not in found[row][first]:
+        raise ValueError(f"evidence: {row!r} and {against!r} have no scores with the same seed; run the study first")
+    verdict, recipe = _WORDS[found[row][first]["verdict"]], plan.budget.recipe
+    cells = []
+    for metric in table.metrics:
+        ours, theirs = found[row][metric], found[against][metric]
+        difference = ours["difference"]
+        seen = f"{difference['seen']:.3f}"
+        cells.append(
+            [TITLES.get(metric, metric), shown(theirs), shown(ours), shown(difference, "+"), ours["verdict"], seen]
+        )
+    head = ["", against, row, "difference", "verdict", "smallest that would be seen"]
+    gaps = gaps_by_clip(results, row, against, first)
+    worst = min(gaps, key=lambda pair: pair[1])
+    costs = [
+        f"{title}: {found[against][name] / unit:.3g} → {found[row][name] / unit:.3g}"
+        for name, title, unit in (
+            ("parameters", "parameters (M)", 1e6),
+            ("multiply_adds", "multiply-adds a query and frame (M)", 1e6),
+            ("steps", "steps", 1),
+        )
+        if found[against][name] and found[row][name]
+    ]
+    lines = [
+        f"### Claim: {claim}",
+        f"**{verdict.capitalize()}**, by {TITLES.get(first, first)} over {plan.seeds} seeds and {len(gaps)} clips; "
+        f"{len(table.rows) - 1} rows of the study were compared with {against} in {len(table.metrics)} metrics.",
+        f"**Setting.** {recipe.clips} training clips of {recipe.tracker_config().image_size} pixels, one encoder, "
+        f"frozen after {recipe.matching_steps} steps of matching; {recipe.frames[1]} frames and {recipe.sampling.tracks} "
+        f"tracks an example; seeds 0 to {plan.seeds - 1}. What differs: `{plan.rows[row].to_dict()}`.",
+        markdown_table(head, cells),
+        *([f"**Costs.** {'; '.join(costs)}."] if costs else []),
+        f"**Against it.** The clip on which {row} loses most, or gains least: {worst[0]}, {worst[1]:+.3f}. "
+        f"It is behind on {sum(gap < 0 for _, gap in gaps)} of {len(gaps)} clips.",
+        "**What would refute it.**\n\n" + "\n".join(f"- {sentence}" for sentence in refuted_by if sentence.strip()),
+        f"Code {digest(str(sorted(plan.code.items())))}, clips {digest(str(sorted(plan.clips.items())))}.",
+    ]
+    text = "\n\n".join(lines) + "\n"
+    write_text(path, text)
+    return Evidence(text, verdict, Path(path))
