@@ -57,7 +57,7 @@ _SMALL = {
 }  # fmt: skip
 
 
-def budget(steps: int, clips: int = 60, held_out: int = 16) -> Budget:
+def budget(steps: int, clips: int = 40, held_out: int = 12) -> Budget:
     """The laboratory's clips and recipe with a smaller tracker, fewer clips and fewer points: about 50 ms a step on an idle core."""
     lab = BUDGETS["lab"]
     options = {"clips": clips, "steps": steps, "matching_steps": max(20, steps // 2), "average": max(1, steps // 8)}
