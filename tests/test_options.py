@@ -216,7 +216,7 @@ def lines(sample, folder):
     run, results = folder / "run", folder / "results.json"
     rows = {name: {"tracker": name} for name in ("static", "klt")}
     (folder / "pixels.csv").write_text("# frame,u,v\n0,10,20\n3,64.5,90\n")
-    (folder / "own.json").write_text(json.dumps({"rows": rows, "budget": "tiny"}))
+    (folder / "own.json").write_text(json.dumps({"rows": rows}))
     train = ["train", "--out", run, "--data", folder / "clips", "--device", "cpu", "--workers", 0, "--no-compiled"]
     return [
         ["convert", sample, folder / "images", "--format", "npz"],
@@ -238,8 +238,9 @@ def lines(sample, folder):
         ["card", run, results, "--hardware", "a core", "--out", folder / "CARD.md", "--name", "mine",
          "--weights", run / "weights.safetensors", "--command", "train", "--allow", "mine",
           "--also", Path(__file__).parents[1] / "README.md"],
-        ["lab", "run", folder / "own.json", "--jobs", 1, "--device", "cpu", "--accept-code", "--allow", "mine"],
-        ["lab", "report", folder / "runs" / "own", "--against", "klt", "--metric", "OA", "--out", folder / "report"],
+        ["lab", "run", folder / "own.json", "--jobs", 1, "--device", "cpu", "--accept-code", "--allow", "mine", "--budget", "tiny",
+         "--seeds", 1],
+        ["lab", "report", folder / "runs" / "own, tiny", "--against", "klt", "--metric", "OA", "--out", folder / "report"],
         ["curves", run, run / "log.jsonl", "--out", folder / "curves.png", "--by", "minutes"],
     ]  # fmt: skip
 
