@@ -18,7 +18,7 @@ _WORDS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evidence:
     """A page of Markdown; a notebook shows it as text.
 
@@ -32,8 +32,10 @@ class Evidence:
     verdict: str
     path: Path
 
-    def _repr_markdown_(self) -> str:
+    def __repr__(self) -> str:
         return self.text
+
+    _repr_markdown_ = __repr__
 
 
 def evidence(study: Study, row: str, against: str, claim: str, refuted_by: Sequence[str], path: str | Path) -> Evidence:

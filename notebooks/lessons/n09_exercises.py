@@ -13,9 +13,8 @@ from tapip3d_lite.geometry import THRESHOLDS
 
 def most_alike(own: Tensor, features: Tensor, valid: Tensor, k: int, slip: str = "") -> Tensor:
     """Indices (F, N, k) of the cells whose features (F, P, C) are most alike to `own` (F, N, C), by their cosine."""
-    if slip != "plain dots":
-        features = F.normalize(features, dim=1 if slip == "normalised over cells" else -1)
-    likeness = F.normalize(own, dim=-1) @ features.mT
+    unit = F.normalize(features, dim=1 if slip == "normalised over cells" else -1)
+    likeness = F.normalize(own, dim=-1) @ (features if slip == "plain dots" else unit).mT
     if slip == "distance":
         likeness = -torch.cdist(own, features)
     if slip == "shared":
