@@ -63,6 +63,15 @@ def test_outputs_are_fresh_and_clean(path):
 
 
 @each_notebook
+def test_nothing_asks_the_network(path):
+    lessons = (ROOT / "notebooks" / "lessons").rglob("*.py")
+    for source in [*(c.source for c in code_cells(read(path))), *(x.read_text(encoding="utf-8") for x in lessons)]:
+        assert not re.search(
+            r"^\s*(?:import|from) (?:urllib|requests|http|socket|ftplib)\b|\b(?:wget|curl|pip) ", source, re.M
+        )
+
+
+@each_notebook
 def test_links_lead_somewhere(path):
     for cell in read(path).cells:
         for target in re.findall(r"\]\(([\w./-]+)[)#]", cell.source) if cell.cell_type == "markdown" else ():
