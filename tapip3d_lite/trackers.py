@@ -25,7 +25,7 @@ def list_trackers() -> list[str]:
 
 
 def load_tracker(
-    name: str | Path = "lite", device: Any = "cpu", fast: bool = True, parts: Sequence[Any] = ()
+    name: str | Path = "lite", device: Any = "cpu", fast: bool = True, parts: Sequence[Any] | type | str = ()
 ) -> TrackerLike:
     """A tracker by name, or from a weights file.
 
@@ -52,7 +52,7 @@ def load_tracker(
 
 
 def tracker_runs(
-    names: Sequence[str], spaces: Sequence[str], device: str = "cpu", parts: Sequence[Any] = ()
+    names: Sequence[str], spaces: Sequence[str], device: str = "cpu", parts: Sequence[Any] | type | str = ()
 ) -> Iterator[tuple]:
     """(label, tracker, options of `track`) of trackers by name: `klt`, and of learnt ones each space, `lite · world`.
 

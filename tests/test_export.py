@@ -4,6 +4,7 @@ import csv
 
 import cv2
 import numpy as np
+import plotly.graph_objects as go
 import pytest
 
 import tapip3d_lite as t3d
@@ -107,7 +108,7 @@ def test_an_unknown_suffix_writes_nothing(clip, tmp_path):
         lambda: clip.tracks.save(tmp_path / "a.csv", clip),
         lambda: clip.save(tmp_path / "a.mat"),
         lambda: t3d.figures.save_png(figure, tmp_path / "a.jpg"),
-        lambda: t3d.figures.save_html(None, tmp_path / "a.png"),
+        lambda: t3d.figures.save_html(go.Figure(), tmp_path / "a.png"),
     ):
         with pytest.raises(ValueError, match=r"this is written as .*, got (\.\w+|no suffix); rename it"):
             write()
