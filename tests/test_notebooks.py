@@ -33,8 +33,9 @@ def outputs(nb):
 
 
 def test_there_are_notebooks():
-    assert [p.stem[:2] for p in NOTEBOOKS] == [f"{i:02d}" for i in range(len(NOTEBOOKS))]
-    assert len(NOTEBOOKS) >= 3
+    numbers = [p.stem[:2] for p in NOTEBOOKS]
+    assert numbers == sorted(set(numbers)) and set(numbers) <= {f"{i:02d}" for i in range(11)}  # 08 and 10 are to come
+    assert len(numbers) >= 9
 
 
 @each_notebook
