@@ -121,7 +121,15 @@ def check_range(config: object, low: float, high: float, *names: str) -> None:
             raise ValueError(f"{type(config).__name__}.{name}: expected {wanted}, got {value}")
 
 
-_KINDS = {"bool": bool | np.bool_, "str": str, "None": type(None), "Path": PathLike, "slice": slice, "Mapping": Mapping}
+_KINDS = {
+    "bool": bool | np.bool_,
+    "type": type,
+    "str": str,
+    "None": type(None),
+    "Path": PathLike,
+    "slice": slice,
+    "Mapping": Mapping,
+}
 _OURS = {"Clip", "Tracks", "Tracker", "TrackerConfig", "SimulationConfig", "Figure"}  # other words fit anything
 
 

@@ -392,7 +392,6 @@ EXPRESSIONS = (
         ("t3d.load_tracker('lite', 5)", "device"),
         ("t3d.load_tracker('lite', 'tpu')", "device"),
         ("t3d.load_tracker('lite', fast='yes')", "fast"),
-        ("t3d.load_tracker('lite', parts='my_parts')", "parts"),
         ("t3d.load_tracker('lite', parts=5)", "parts"),
         ("t3d.load_weights(5)", "path"),
         ("t3d.load_weights('cut.safetensors')", "cut.safetensors"),
