@@ -32,7 +32,7 @@ from tapip3d_lite.evaluation.intervals import bootstrap_interval, paired_differe
 from tapip3d_lite.evaluation.lite_splits import benchmark_clips
 from tapip3d_lite.files import write_text
 from tapip3d_lite.geometry import unproject
-from tapip3d_lite.simulate.degrade import SensorConfig, degrade, wrong_poses
+from tapip3d_lite.lab.conditions import under
 
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)  # pixels a frame, of 128
 RUNS: dict[str, dict] = {
@@ -48,32 +48,26 @@ DISTANCE, FOCAL, SIDE = 5.0, 128.0, 128
 METRICS = ("AJ3D_none", "APD3D_none", "AJ3D_none_dynamic", "APD3D_none_dynamic", "OA")
 
 
-def sensor(**strengths: float) -> Callable[[Clip, int], Clip]:
-    return lambda clip, seed: degrade(clip, SensorConfig(**strengths), seed)
-
-
 def grey(clip: Clip, _seed: int) -> Clip:
     images = [cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) for image in clip.video]
     return replace(clip, video=np.stack(images))
 
 
-def frozen_depth(clip: Clip, _seed: int) -> Clip:
-    """The first frame's depth in all frames, as a sensor that hangs gives it."""
-    return replace(clip, depths=np.repeat(clip.depths[:1], len(clip), 0))
+def flawed(condition: dict) -> Callable[[Clip, int], Clip]:
+    """A condition of the laboratory."""
+    return lambda clip, seed: under(clip, condition, seed)
 
 
 CONDITIONS: dict[str, Callable[[Clip, int], Clip]] = {
-    "as it is": lambda clip, _seed: clip,
-    "poses wrong by 0.5°": lambda clip, seed: wrong_poses(clip, 0.5, seed, drift=0),
-    "poses wrong by 1°": lambda clip, seed: wrong_poses(clip, 1.0, seed, drift=0),
-    "poses wrong by 2°": lambda clip, seed: wrong_poses(clip, 2.0, seed, drift=0),
-    "depth scale flickers by 2 %": sensor(flicker=0.02),
-    "depth noise of 1 %": sensor(noise=0.01),
-    "depth noise of 5 %": sensor(noise=0.05),
-    "half of the depth missing": sensor(dropout=0.5),
-    "images blurred by 2 px": sensor(blur=2.0),
+    "as it is": flawed({}),
+    **{f"poses wrong by {degrees:g}°": flawed({"poses": degrees}) for degrees in (0.5, 1.0, 2.0)},
+    "depth scale flickers by 2 %": flawed({"flicker": 0.02}),
+    "depth noise of 1 %": flawed({"noise": 0.01}),
+    "depth noise of 5 %": flawed({"noise": 0.05}),
+    "half of the depth missing": flawed({"dropout": 0.5}),
+    "images blurred by 2 px": flawed({"blur": 2.0}),
     "grey images": grey,
-    "frozen depth": frozen_depth,
+    "frozen depth": flawed({"frozen": "depths"}),
 }
 
 
