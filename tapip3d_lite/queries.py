@@ -182,3 +182,8 @@ def near_origin(clip: Clip, shift: np.ndarray | None = None) -> tuple[Clip, np.n
     poses = clip.extrinsics.astype(np.float64)
     poses[:, :3, 3] += poses[:, :3, :3] @ shift
     return replace(clip, extrinsics=poses, queries=None, tracks=None) if shift.any() else clip, shift
+
+
+def shifted(rows: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Rows (t, x, y, z) in the world of the clip that `near_origin` made, float32."""
+    return (rows - np.r_[0, shift]).astype(np.float32)

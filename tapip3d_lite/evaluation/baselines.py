@@ -10,7 +10,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project, unproject
-from tapip3d_lite.queries import near_origin, resolve_queries
+from tapip3d_lite.queries import near_origin, resolve_queries, shifted
 from tapip3d_lite.validate import checked
 
 
@@ -44,7 +44,7 @@ class Baseline:
         With `bidirectional=False` Lucas-Kanade holds a point still and counts it as hidden before its query.
         """
         queries, (near, shift) = resolve_queries(clip, queries), near_origin(clip)
-        found = self._follow(near, (queries - np.r_[0, shift]).astype(np.float32), bidirectional)
+        found = self._follow(near, shifted(queries, shift), bidirectional)
         return replace(found, xyz=found.xyz + shift, queries=queries)
 
 

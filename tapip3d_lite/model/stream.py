@@ -21,7 +21,7 @@ from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.track import check_options, visibility
 from tapip3d_lite.model.windows import Scene, State, Step, to_world
-from tapip3d_lite.queries import near_origin, support_queries
+from tapip3d_lite.queries import near_origin, shifted, support_queries
 from tapip3d_lite.validate import checked, floats
 
 
@@ -100,7 +100,7 @@ class Stream:
             )
         numbers = len(self.queries) + np.arange(len(rows))
         self.queries = np.concatenate([self.queries, rows])
-        self._enter((rows - np.r_[0, self.shift]).astype(np.float32), numbers)
+        self._enter(shifted(rows, self.shift), numbers)
         return numbers
 
     def drop(self, numbers: np.ndarray) -> None:
@@ -141,7 +141,7 @@ class Stream:
         frames = frames_from_clip(clip, device=self.rows.device)
         if self.seen == 0:
             self.space = fitted(self.space, frames)
-            self.rows[0] = torch.from_numpy(self.queries[self.numbers] - np.r_[0, self.shift])
+            self.rows[0] = torch.from_numpy(shifted(self.queries[self.numbers], self.shift))
             grid = support_queries(clip, self.grid) if self.grid else self.queries[:0]
             self._enter(grid, np.full(len(grid), -1))
         with torch.no_grad():

@@ -24,7 +24,7 @@ from tapip3d_lite.geometry import in_image
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.config import INTERCHANGEABLE, TrackerConfig
 from tapip3d_lite.model.frames import Frames, crop_clip, frames_from_clip, resize_clip
-from tapip3d_lite.queries import near_origin, resolve_queries, support_queries
+from tapip3d_lite.queries import near_origin, resolve_queries, shifted, support_queries
 from tapip3d_lite.validate import checked
 
 _KEPT = 2**27  # floats of features kept for a whole clip (512 MiB); of longer clips only a window's are
@@ -81,7 +81,7 @@ def track(
         tracker.config = tracker.config.replace(image_size=size)
     asked, count = resolve_queries(clip, queries), len(clip)
     clip, shift = near_origin(clip)
-    queries = (asked - np.r_[0, shift]).astype(np.float32)
+    queries = shifted(asked, shift)
     clip = _prepared(clip, tracker.config, crop)
     roi = quantile_roi(torch.from_numpy(clip.depths)) if isinstance(depth_roi, str) else depth_roi
     options = {"iterations": iterations, "space": space, "depth_roi": roi}
