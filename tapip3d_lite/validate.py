@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def video_frames(video: np.ndarray, name: str = "Clip.video") -> np.ndarray:
     """A video (T, H, W, 3) uint8 with at least one frame, or ValueError."""
-    video = _array("Clip.video", video)
+    video = _array(name, video)
     if video.ndim != 4 or video.shape[-1] != 3 or video.dtype != np.uint8:
         raise ValueError(
             f"{name}: expected (T, H, W, 3) uint8 RGB, got {video.shape} {video.dtype}; move the colour axis last, drop alpha, scale [0, 1] floats by 255"

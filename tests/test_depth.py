@@ -62,6 +62,7 @@ def shifted(images, rows):
         (lambda a, b: {"left": a[:0], "right": b[:0]}, "left: zero frames"),
         (lambda a, b: {"left": a / 255}, "left: .*float64"),
         (lambda a, b: {"left": a[0]}, "left: expected"),
+        (lambda a, b: {"right": [[[0, 0, 0]], [[0, 0]]]}, "right: expected an array, got rows of different lengths"),
         (lambda a, b: {"baseline": 0}, "baseline: expected a positive"),
         (lambda a, b: {"baseline": -0.1}, "baseline"),
         (lambda a, b: {"baseline": np.nan}, "baseline"),

@@ -323,7 +323,7 @@ def test_inactive_tracks_are_seen_by_nobody(rng):
         ({"window": 7}, "even"),
         ({"neighbors": 99}, "coarsest of 2 levels has 4x6 cells"),
         ({"feature_dim": 10}, "multiple of 4"),
-        ({"space_depth": 3}, "space_depth: expected a divisor of"),
+        ({"space_depth": 3}, "divide time_depth"),
         ({"outputs": 4}, "outputs"),
         ({"heads": 0}, "heads: expected a positive number"),
         ({"neighborhood": "planes"}, "set both or none"),

@@ -189,7 +189,7 @@ class TrackerConfig:
             raise ValueError(f"TrackerConfig.feature_dim: expected a multiple of 4, got {self.feature_dim}")
         if self.time_depth % self.space_depth:
             raise ValueError(
-                f"TrackerConfig.space_depth: expected a divisor of {self.time_depth}, got {self.space_depth}"
+                f"TrackerConfig.space_depth: expected a number that can divide time_depth = {self.time_depth}, got {self.space_depth}"
             )
         check_range(self, 0, 2**10, "support_grid")
         check_range(self, 1, _MOST, "image_size")

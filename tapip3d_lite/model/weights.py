@@ -40,15 +40,16 @@ def save_weights(tracker: Tracker, path: str | Path, half: bool = False) -> None
     check_state(state, state)
     data = safetensors.torch.save(state, metadata={"format": _FORMAT, "config": config})
     end = 8 + int.from_bytes(data[:8], "little")
-    header = json.dumps(
-        json.loads(data[8:end]), sort_keys=True
-    ).encode()  # else in random order: same weights, same bytes
+    # Sorted, since safetensors orders at random: same weights, same bytes.
+    header = json.dumps(json.loads(data[8:end]), sort_keys=True).encode()
     header = header.ljust(-(-len(header) // 8) * 8)
     with atomic_path(path) as temporary:
         temporary.write_bytes(len(header).to_bytes(8, "little") + header + data[end:])
 
 
-def load_weights(path: str | Path, device: Any = "cpu", fast: bool = True, parts: Sequence[Any] = ()) -> Tracker:
+def load_weights(
+    path: str | Path, device: Any = "cpu", fast: bool = True, parts: Sequence[Any] | type | str = ()
+) -> Tracker:
     """Read a tracker that `save_weights` wrote, in evaluation mode, to a device; `fast` as for `Tracker`.
 
     Custom parts that the file names must be among `parts`: classes, matched by name, or names of modules to import.
