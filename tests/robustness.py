@@ -1,8 +1,8 @@
 """What happens to a tracker outside the benchmark's clean clips: `python -m tests.robustness --tracker lite static klt`.
 
 A picture that slides at a constant speed; wrong poses, poor depth, soft and grey images and frozen depth on clips of
-`moving-camera`, each against the same clips as they are, paired; the share of hidden frames called visible; what other
-image sizes, fewer updates and bfloat16 cost and save. Results go to a JSON file, which an interrupted run continues, a
+`moving-camera`, each against the same clips as they are, paired; poor sensors and wrong poses after `steady_clip`; the
+share of hidden frames called visible; what other image sizes, fewer updates and bfloat16 cost and save. Results go to a JSON file, which an interrupted run continues, a
 Markdown page (for `card --also`) and a figure.
 """
 
@@ -29,7 +29,7 @@ from tapip3d_lite.clip import Clip
 from tapip3d_lite.evaluation.benchmark import show
 from tapip3d_lite.evaluation.evaluate import markdown_table
 from tapip3d_lite.evaluation.intervals import bootstrap_interval, paired_difference
-from tapip3d_lite.evaluation.lite_splits import benchmark_clips
+from tapip3d_lite.evaluation.lite_splits import COUNT, benchmark_clips
 from tapip3d_lite.files import write_text
 from tapip3d_lite.geometry import unproject
 from tapip3d_lite.lab.conditions import under
@@ -37,12 +37,13 @@ from tapip3d_lite.lab.conditions import under
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)  # pixels a frame, of 128
 RUNS: dict[str, dict] = {
     "as it is": {},  # once more, right beside the others, since seconds are compared
+    "one update": {"iterations": 1},
     "two updates": {"iterations": 2},
     "four updates": {"iterations": 4},
+    "two updates, 128x128 pixels": {"iterations": 2, "size": (128, 128)},  # what the weights before these ran with
     "bfloat16": {"autocast": True},
-    "two updates, bfloat16": {"iterations": 2, "autocast": True},
     "one way": {"bidirectional": False},
-    **{f"{side}x{side} pixels": {"size": (side, side)} for side in (96, 192, 256)},
+    **{f"{side}x{side} pixels": {"size": (side, side)} for side in (96, 128, 192, 256)},
 }
 DISTANCE, FOCAL, SIDE = 5.0, 128.0, 128
 METRICS = ("AJ3D_none", "APD3D_none", "AJ3D_none_dynamic", "APD3D_none_dynamic", "OA")
@@ -76,7 +77,8 @@ def steadied(change: Callable[[Clip, int], Clip]) -> Callable[[Clip, int], Clip]
     return lambda clip, seed: t3d.steady_clip(change(clip, seed))
 
 
-JITTER = ("as it is", "poses", "depth scale")
+STEADIED = ("drift", "sensor")  # splits of the benchmark
+JITTER = ("as it is", "poses", "depth scale", "depth noise")
 CONDITIONS |= {f"{name}, steadied": steadied(CONDITIONS[name]) for name in CONDITIONS if name.startswith(JITTER)}
 
 
@@ -146,6 +148,10 @@ def measure(names: list[str], count: int, out: Path) -> dict:
             jobs[f"{name} {index}"] = lambda t, c=clip, f=change, i=index: scored(t, f(c, i))
         for name, options in RUNS.items():
             jobs[f"run {name} {index}"] = lambda t, c=clip, o=options: scored(t, c, **o)
+    for split in STEADIED:
+        for index, clip in enumerate(benchmark_clips(split)):
+            jobs[f"{split} {index}"] = lambda t, c=clip: scored(t, c)
+            jobs[f"{split}, steadied {index}"] = lambda t, c=clip: scored(t, t3d.steady_clip(c))
     for name in names:
         tracker, mine = t3d.load_tracker(name), results.setdefault(name, {})
         todo = [job for job in jobs if job not in mine and (hasattr(tracker, "config") or not job.startswith("run"))]
@@ -158,7 +164,7 @@ def measure(names: list[str], count: int, out: Path) -> dict:
 def page(results: dict, count: int) -> str:
     """The Markdown page."""
 
-    def scores(name: str, what: str, metric: str) -> list[float]:
+    def scores(name: str, what: str, metric: str, count: int = count) -> list[float]:
         found = [results[name].get(f"{what} {index}", {}).get(metric) for index in range(count)]
         return [math.nan if x is None else x for x in found]
 
@@ -179,6 +185,14 @@ def page(results: dict, count: int) -> str:
             pairs = [[scores(name, x, m) for x in (what, "as it is")] for m in METRICS[:2]]
             rows.append([name, what, *own, *(show(paired_difference(*pair), "+") for pair in pairs)])
     parts += [markdown_table(["tracker", "condition", *METRICS[:2], "AJ3D_none lost", "APD3D_none lost"], rows)]
+    parts += ["Splits of the benchmark, as they are and after `steady_clip`, and what that gains:"]
+    rows = []
+    for split in STEADIED:
+        for name in names:
+            two = [[scores(name, f"{split}{how}", m, COUNT) for how in (", steadied", "")] for m in METRICS[:4]]
+            rows.append([split, name, *(show(bootstrap_interval(after)) for after, _ in two)])
+            rows[-1] += [show(paired_difference(*pair), "+") for pair in two[:2]]
+    parts += [markdown_table(["split", "tracker", *METRICS[:4], *(f"{m} gained" for m in METRICS[:2])], rows)]
     parts += ["Truly hidden frames, from the query on, that are called visible:"]
     shares = ("hidden_visible", "hidden_visible_dynamic")
     rows = [[n, *(show(bootstrap_interval(scores(n, "as it is", m))) for m in shares)] for n in names]

@@ -133,11 +133,11 @@ def both_ways(forward: Pass, backward: Pass, queries: np.ndarray) -> np.ndarray:
 
 
 def _tracks(space: str | None = None, late: bool = False, neighborhood: str | None = None) -> np.ndarray:
-    tracker = t3d.load_tracker("lite", fast=False).double()
+    tracker, (frames, queries) = t3d.load_tracker("lite", fast=False).double(), frames_and_queries(late)
+    tracker.config = replace(tracker.config, image_size=frames.size)  # no image is resized: less to wait for
     if neighborhood:
         config = replace(tracker.config, neighborhood=neighborhood)
         tracker.neighborhood = make_module("neighborhood", config, fast=False)
-    frames, queries = frames_and_queries(late)
 
     def way(frames: Frames) -> Pass:
         return lambda rows: tracker(frames, torch.from_numpy(rows)[None], space=space)[0][0].numpy()
