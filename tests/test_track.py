@@ -119,7 +119,9 @@ def test_a_crop_makes_a_small_object_large(lite):
     mine = large.tracks.visible.all(0) & ((uv > 70) & (uv < 186)).all((0, 2)) & large.tracks.dynamic
     queries = np.concatenate([np.zeros((mine.sum(), 1)), large.tracks.xyz[0, mine]], -1).astype(np.float32)
     error = {
-        crop: np.linalg.norm(lite.track(large, queries, crop=crop, size=(128, 128)).xyz - large.tracks.xyz[:, mine], axis=-1).mean()
+        crop: np.linalg.norm(
+            lite.track(large, queries, crop=crop, size=(128, 128)).xyz - large.tracks.xyz[:, mine], axis=-1
+        ).mean()
         for crop in (None, (64, 64, 192, 192))
     }
     assert mine.sum() >= 8 and error[64, 64, 192, 192] < error[None]
