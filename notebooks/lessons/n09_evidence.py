@@ -14,7 +14,7 @@ from tapip3d_lite.lab.table import TITLES, gaps_by_clip, shown
 _WORDS = {
     "better": "supported",
     "worse": "refuted: the difference has the other sign",
-    "undecided": "undecided: the interval holds 0",
+    "undecided": "undecided, after Holm's correction over all comparisons of the table",
 }
 
 
@@ -24,7 +24,7 @@ class Evidence:
 
     Attributes:
         text: the page.
-        verdict: `"supported"`, `"refuted: …"` or `"undecided: …"`.
+        verdict: `"supported"`, `"refuted: …"` or `"undecided, …"`.
         path: where it was written.
     """
 
@@ -100,7 +100,7 @@ def evidence(
     ]
     lines = [
         f"### Claim: {claim}",
-        f"**{verdict.capitalize()}**, by {TITLES.get(first, first)} over {plan.seeds} seeds and {len(gaps)} clips; "
+        f"**{verdict[0].upper() + verdict[1:]}**, by {TITLES.get(first, first)} over {plan.seeds} seeds and {len(gaps)} clips; "
         f"{len(table.rows) - 1} rows of the study were compared with {against} in {len(table.metrics)} metrics.",
         f"**Setting.** {recipe.clips} training clips of {recipe.tracker_config().image_size} pixels, one encoder, "
         f"frozen after {recipe.matching_steps} steps of matching; {recipe.frames[1]} frames and {recipe.sampling.tracks} "
