@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -19,7 +20,6 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 import tapip3d_lite as t3d
-from tapip3d_lite.check import NOISE, consistency
 from tapip3d_lite.evaluation.benchmark import ALL, METRICS, SPLITS, run_benchmark, summary_table
 from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
 from tapip3d_lite.export import WRITERS
@@ -142,16 +142,12 @@ def demo(
 
 
 def check(clip: Positional[Path], /, format: Format = "auto") -> None:
-    """Look for the usual mistakes in a clip: camera direction, axes, intrinsics, units, ray length."""
-    loaded = t3d.load_clip(clip, format, points=False)
-    findings, error = t3d.check_clip(loaded), consistency(loaded)
-    text = f"{clip}: nothing suspicious found"
-    if error > NOISE:
-        text = (
-            f"{clip}: no usual mistake found, but the static scene does not fit together: relative depth error {error:.3g}, "
-            f"above {NOISE}. Noisy depth does that, or much motion; else compare poses, intrinsics and frames with their source"
-        )
-    print("\n".join(map(str, findings)) if findings else text)
+    """Look for the usual mistakes in a clip: camera direction, axes, intrinsics, units, depth, order of frames, registration."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        findings = t3d.check_clip(t3d.load_clip(clip, format, points=False))
+    lines = [str(warning.message) for warning in said] + [str(finding) for finding in findings]
+    print("\n".join(lines) if lines else f"{clip}: nothing suspicious found")
 
 
 def convert(

@@ -18,6 +18,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert, project, transform, unproject
+from tapip3d_lite.measures import smooth_inverse
 
 SCALE, POSES, BOTH = slice(6, 7), slice(6), slice(7)  # what may change of a frame's (translation, rotation, log scale)
 _SPREADS = ((4, 0.2), (4, 0.2), (2, 0.1), (1, 0.05), (0.6, 0.03), (0.4, 0.02), (0.3, 0.015), (0.3, 0.015))
@@ -48,7 +49,7 @@ class Views:
         self.pixel, self.unit = min(clip.size) / 128, float(np.median(clip.depths[clip.depths > 0]))
         self.k = clip.intrinsics / np.array([[self.pixel], [self.pixel], [1.0]])
         self.gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in clip.video]
-        self.inverse = [_smooth_inverse(depth / np.float32(self.unit)) for depth in clip.depths]
+        self.inverse = [smooth_inverse(depth / np.float32(self.unit)) for depth in clip.depths]
         self.corners, self.x = [], []
         for gray, inverse, k in zip(self.gray, self.inverse, self.k, strict=True):
             mask = np.isfinite(inverse).astype(np.uint8)
@@ -83,18 +84,6 @@ class Views:
         kept = (out & home)[:, 0].astype(bool) & (np.linalg.norm(back - here, axis=-1) < 0.5 * self.pixel)
         kept &= np.isfinite(inverse)
         return Pair(a, b, x[kept], there[kept] / self.pixel, 1 / inverse[kept].astype(np.float64))
-
-
-def _smooth_inverse(depth: np.ndarray) -> np.ndarray:
-    """1/z averaged over 3 x 3 pixels (exact on planes), (H, W) float32; NaN at silhouettes and where depth is missing."""
-    valid = (depth > 0).astype(np.float32)
-    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
-    share, first, second = (cv2.blur(x, (3, 3)) for x in (valid, inverse, inverse**2))
-    mean = first / np.maximum(share, 1e-6)
-    spread = np.sqrt(np.maximum(second / np.maximum(share, 1e-6) / np.maximum(mean, 1e-6) ** 2 - 1, 0))
-    known = share > 0.4
-    limit = max(0.03, 2.5 * float(np.median(spread[known]))) if known.any() else 0  # noise is no silhouette
-    return np.where(known & (spread < limit), mean, np.float32(np.nan))
 
 
 @dataclass(frozen=True)

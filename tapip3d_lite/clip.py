@@ -15,7 +15,7 @@ import numpy as np
 
 from tapip3d_lite.files import save_npz
 from tapip3d_lite.geometry import point_map, project
-from tapip3d_lite.validate import bools, check_about, check_cameras, checked, floats, video_frames
+from tapip3d_lite.validate import bools, check_about, check_cameras, checked, floats, known_depths, video_frames
 
 CLIP_KEYS = ("video", "depths", "intrinsics", "extrinsics")
 OWN_KEYS = (*CLIP_KEYS, "query_point", "tracks", "visible", "dynamic", "name", "fps")
@@ -102,16 +102,11 @@ class Clip:
         check_about(self, OWN_KEYS)
         frames, height, width = self.video.shape[:3]
         depths = floats("Clip.depths", self.depths, (frames, height, width), like="video (T, H, W, 3)")
-        depths = np.where(np.isfinite(depths) & (depths > 0), depths, np.float32(0))
-        if not depths.any() and frames > 1:  # a single frame may be one of a stream
-            raise ValueError(
-                "Clip.depths: no valid pixel in the whole clip (all 0, negative or non-finite); check the file's unit and key"
-            )
-        _set(self, "depths", depths)
+        _set(self, "depths", known_depths(depths))
         for key, side in (("intrinsics", 3), ("extrinsics", 4)):
             shape, like = (frames, side, side), "video (T, H, W, 3)"
             _set(self, key, floats(f"Clip.{key}", getattr(self, key), shape, True, like, key == "extrinsics"))
-        check_cameras(self.intrinsics, self.extrinsics)
+        _set(self, "extrinsics", check_cameras(self.intrinsics, self.extrinsics))
         if self.queries is None and self.tracks is not None:
             _set(self, "queries", self.tracks.queries)
         if self.queries is not None:

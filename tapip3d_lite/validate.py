@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import re
+import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import fields
 from functools import wraps
@@ -16,6 +17,9 @@ import numpy as np
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+_RIGID = 1e-4  # above it a tracker's coordinates differ by more than a millimetre
+_PLAUSIBLE = 1000.0  # times the lower decile of the depths
 
 
 def video_frames(video: np.ndarray, name: str = "Clip.video") -> np.ndarray:
@@ -30,8 +34,11 @@ def video_frames(video: np.ndarray, name: str = "Clip.video") -> np.ndarray:
     return video
 
 
-def check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
-    """Raise ValueError unless intrinsics (T, 3, 3) are [fx s cx; 0 fy cy; 0 0 1], fx and fy > 0, and poses (T, 4, 4) rigid."""
+def check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> np.ndarray:
+    """The poses (T, 4, 4), with a warning made rigid where rounding (4 digits in a file) has left them almost so.
+
+    ValueError unless intrinsics (T, 3, 3) are [fx s cx; 0 fy cy; 0 0 1], fx and fy > 0, and poses rigid.
+    """
     focal = intrinsics[:, [0, 1], [0, 1]]
     if not (focal > 0).all():
         raise ValueError(f"Clip.intrinsics: fx and fy must be positive, got {focal[(focal <= 0).any(-1)][0].tolist()}")
@@ -51,6 +58,16 @@ def check_cameras(intrinsics: np.ndarray, extrinsics: np.ndarray) -> None:
             f"Clip.extrinsics: frame {frame} is not a rigid world-to-camera motion (R R^T differs from I by {error[frame]:.2g}, "
             f"det R = {np.linalg.det(rotation[frame]):.2g}, last row {extrinsics[frame, 3].tolist()}); remove scale, use row-major [R|t; 0 0 0 1]"
         )
+    if (error > _RIGID).any():
+        u, _, v = np.linalg.svd(rotation.astype(np.float64))
+        extrinsics = extrinsics.copy()
+        extrinsics[:, :3, :3] = u @ v
+        warnings.warn(
+            f"Clip.extrinsics: rotations of {int((error > _RIGID).sum())} frames are not orthonormal (R R^T differs from I by up to "
+            f"{error.max():.2g}); the nearest rotations are taken. Write poses with 7 digits",
+            stacklevel=5,
+        )
+    return extrinsics
 
 
 def check_about(clip: Any, taken: Collection[str]) -> None:
@@ -93,6 +110,34 @@ def _array(name: str, value: object) -> np.ndarray:
         return np.asarray(value)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name}: expected an array, got rows of different lengths or no numbers ({error})") from None
+
+
+def known_depths(depths: np.ndarray) -> np.ndarray:
+    """Depths with 0 where they are unknown: not positive, not finite, or a mark for the sky such as 65504 or 1e10.
+
+    A warning counts such marks: what lies beyond 1,000 times the lower decile of the depths, and infinity if frequent.
+    ValueError where nothing is left of several frames.
+    """
+    finite = np.isfinite(depths)
+    known = finite & (depths > 0)
+    if not known.any():
+        if len(depths) == 1:  # one frame may be one of a stream
+            return np.zeros_like(depths)
+        raise ValueError(
+            "Clip.depths: no valid pixel in the whole clip (all 0, negative or non-finite); check the file's unit and key"
+        )
+    values = depths[known][:: max(known.sum() // 10_000, 1)]
+    limit = _PLAUSIBLE * np.partition(values, len(values) // 10)[len(values) // 10]
+    beyond, infinite = known & (depths > limit), np.isposinf(depths)
+    known &= ~beyond
+    if beyond.any() or infinite.mean() > 0.01:
+        marks = beyond | infinite
+        warnings.warn(
+            f"Clip.depths: {int(marks.sum())} pixels ({marks.mean():.1%}) lie beyond {limit:.4g} or at infinity, as the sky's "
+            "often do; they are taken as unknown. Set them to 0 where that is right",
+            stacklevel=5,
+        )
+    return depths if known.all() or not depths[~known].any() else np.where(known, depths, np.float32(0))
 
 
 def bools(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:

@@ -58,18 +58,21 @@ def study(tmp_path_factory):
 
 def test_evidence_reads_its_numbers_from_the_study(study, tmp_path):
     claim, doubt = "Lucas-Kanade follows moving points better than nobody", "clips in which nothing moves"
-    page = n09.evidence(study, "klt", "static", claim, [doubt, " "], tmp_path / "page.md")
+    page = n09.evidence(study, "klt", "static", "p2n", claim, [doubt, " "], tmp_path / "page.md")
     one = {row["row"]: row for row in study.table("static").rows}["klt"]["APD3D_none_dynamic"]
     assert page.text == page.path.read_text(encoding="utf-8") == page._repr_markdown_()
     assert claim in page.text and f"- {doubt}\n" in page.text and page.text.count("\n- ") == 1
     assert f"{one['difference']['mean']:+.3f}" in page.text and f"{one['difference']['seen']:.3f}" in page.text
     words = {"better": "supported", "worse": "refuted", "undecided": "undecided"}
-    assert page.verdict.startswith(words[one["verdict"]]) and page.verdict.capitalize() in page.text
+    assert page.verdict.startswith(words[one["verdict"]]) and page.verdict[1:] in page.text
     assert len(page.text.split()) < 450  # one page
     assert "**Costs.**" not in page.text  # neither is trained
-    for wrong in ({"refuted_by": [""]}, {"claim": " "}, {"row": "static"}):
-        arguments = {"row": "klt", "against": "static", "claim": claim, "refuted_by": [doubt]} | wrong
-        with pytest.raises(ValueError, match=r"evidence: "):
+    said = n09.hearing(study, "p2n", "static")
+    lost = {row["row"]: row for row in study.table("static").rows}["p2n"]["APD3D_none_dynamic"]["verdict"] == "worse"
+    assert said in page.text and ("deaf" in said) == (not lost) and ("can hear" in said) == lost
+    for wrong in ({"refuted_by": [""]}, {"claim": " "}, {"row": "static"}, {"control": "static"}):
+        arguments = {"row": "klt", "against": "static", "control": "p2n", "claim": claim, "refuted_by": [doubt]} | wrong
+        with pytest.raises(ValueError, match=r"evidence: |hearing: "):
             n09.evidence(study, path=tmp_path / "no.md", **arguments)
     assert not (tmp_path / "no.md").exists()
 

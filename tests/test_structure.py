@@ -19,9 +19,9 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # later one of a floor's list uses the earlier ones.
 FLOORS = [
     ["geometry", "archive", "pickled", "files", "validate", "outline", "parts"],
-    ["clip", "depth", "queries", "bundle", "poses"],
+    ["clip", "depth", "queries", "bundle", "poses", "measures", "mistakes", "check"],
     ["formats"],
-    ["check", "simulate", "model"],
+    ["simulate", "model"],
     ["variants", "speed"],
     ["saved", "official", "recorder"],
     ["training", "evaluation"],
@@ -31,7 +31,7 @@ FLOORS = [
     ["lab"],
     ["refusals", "__main__", ""],
 ]
-APART = [("training", "evaluation"), ("variants", "speed"), ("simulate", "model"), ("check", "model")]
+APART = [("training", "evaluation"), ("variants", "speed"), ("simulate", "model")]
 CORE = ["geometry", "clip", "model", "training.loss", "training.backward", "training.trainer"]
 CORE += ["evaluation.metrics", "evaluation.evaluate"]
 
@@ -132,7 +132,7 @@ def test_sizes():
     lengths = list(functions())
     assert not [f for n, f in lengths if n > 60]
     assert statistics.median(n for n, _ in lengths) <= 15
-    assert sum(map(lines, FILES)) <= 15_200  # 10,000 before formats, parts, untrusted files and the laboratory came in
+    assert sum(map(lines, FILES)) <= 15_720  # 10,000 before formats, parts, untrusted files and the laboratory came in
     core = [path for name, path in MODULES.items() if any(f"{name}.".startswith(f"{part}.") for part in CORE)]
     assert sum(map(lines, core)) <= 3_500
 
@@ -189,7 +189,7 @@ def test_a_tracked_clip_touches_few_files():
     )
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     touched = [line for line in result.stdout.splitlines() if line.startswith(str(PACKAGE))]
-    assert 10 < len(touched) <= 17, touched
+    assert 10 < len(touched) <= 18, touched
 
 
 @pytest.mark.parametrize("command", [["check"], ["format", "--check"]], ids=" ".join)

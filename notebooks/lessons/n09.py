@@ -15,7 +15,7 @@ from lessons.checker import check
 from lessons.guesses import reveal
 from lessons.milestone import CLIP, Use, plugged, report
 from lessons.n09_cells import cells_figure, picked, shares_figure
-from lessons.n09_evidence import evidence
+from lessons.n09_evidence import evidence, hearing
 from lessons.n09_exercises import EXERCISES
 from lessons.n09_parts import Blind, NearAndAlike, Ripple, SoftMisses, Vote, errors
 from lessons.pictures import pipeline, show
@@ -37,6 +37,7 @@ __all__ = [
     "errors",
     "evidence",
     "explore",
+    "hearing",
     "in_use",
     "milestone",
     "new_study",

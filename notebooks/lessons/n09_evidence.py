@@ -14,7 +14,7 @@ from tapip3d_lite.lab.table import TITLES, gaps_by_clip, shown
 _WORDS = {
     "better": "supported",
     "worse": "refuted: the difference has the other sign",
-    "undecided": "undecided: the interval holds 0",
+    "undecided": "undecided, after Holm's correction over all comparisons of the table",
 }
 
 
@@ -24,7 +24,7 @@ class Evidence:
 
     Attributes:
         text: the page.
-        verdict: `"supported"`, `"refuted: …"` or `"undecided: …"`.
+        verdict: `"supported"`, `"refuted: …"` or `"undecided, …"`.
         path: where it was written.
     """
 
@@ -38,7 +38,23 @@ class Evidence:
     _repr_markdown_ = __repr__
 
 
-def evidence(study: Study, row: str, against: str, claim: str, refuted_by: Sequence[str], path: str | Path) -> Evidence:
+def hearing(study: Study, control: str, against: str) -> str:
+    """Whether a study tells a control, which must lose, from a row: in words, with the difference.
+
+    ValueError as for `Study.table`, and where the two rows have no scores with the same seed.
+    """
+    table = study.table(against)
+    one = {row["row"]: row for row in table.rows}[control][table.metrics[0]]
+    if "verdict" not in one:
+        raise ValueError(f"hearing: {control!r} and {against!r} have no scores with the same seed; run the study first")
+    told = one["verdict"] == "worse"
+    meaning = "so this study can hear" if told else "so this study is deaf, and its other rows mean nothing yet"
+    return f"{control} minus {against}: {shown(one['difference'], '+')}; {'it loses' if told else 'it does not lose'}, {meaning}"
+
+
+def evidence(
+    study: Study, row: str, against: str, control: str, claim: str, refuted_by: Sequence[str], path: str | Path
+) -> Evidence:
     """Write what a study says about the claim that a row is better than another one.
 
     Every number is read from the study; the words alone are the caller's.
@@ -46,6 +62,7 @@ def evidence(study: Study, row: str, against: str, claim: str, refuted_by: Seque
     Args:
         study: run, with scores of both rows.
         row, against: the row that the claim is about, and the one that it is compared with.
+        control: a row that must lose.
         claim: one sentence.
         refuted_by: what would show that it is wrong; at least one sentence.
         path: of the page.
@@ -83,7 +100,7 @@ def evidence(study: Study, row: str, against: str, claim: str, refuted_by: Seque
     ]
     lines = [
         f"### Claim: {claim}",
-        f"**{verdict.capitalize()}**, by {TITLES.get(first, first)} over {plan.seeds} seeds and {len(gaps)} clips; "
+        f"**{verdict[0].upper() + verdict[1:]}**, by {TITLES.get(first, first)} over {plan.seeds} seeds and {len(gaps)} clips; "
         f"{len(table.rows) - 1} rows of the study were compared with {against} in {len(table.metrics)} metrics.",
         f"**Setting.** {recipe.clips} training clips of {recipe.tracker_config().image_size} pixels, one encoder, "
         f"frozen after {recipe.matching_steps} steps of matching; {recipe.frames[1]} frames and {recipe.sampling.tracks} "
@@ -92,6 +109,7 @@ def evidence(study: Study, row: str, against: str, claim: str, refuted_by: Seque
         *([f"**Costs.** {'; '.join(costs)}."] if costs else []),
         f"**Against it.** The clip on which {row} loses most, or gains least: {worst[0]}, {worst[1]:+.3f}. "
         f"It is behind on {sum(gap < 0 for _, gap in gaps)} of {len(gaps)} clips.",
+        f"**Control.** {hearing(study, control, against)}.",
         "**What would refute it.**\n\n" + "\n".join(f"- {sentence}" for sentence in refuted_by if sentence.strip()),
         f"Code {digest(str(sorted(plan.code.items())))}, clips {digest(str(sorted(plan.clips.items())))}.",
     ]

@@ -17,12 +17,14 @@ from tapip3d_lite.evaluation.evaluate import evaluate, markdown_table
 from tapip3d_lite.evaluation.intervals import Estimate, bootstrap_interval, paired_difference
 from tapip3d_lite.evaluation.lite_splits import ALL, COUNT, SPLITS, benchmark_clips, check_split, split_file
 from tapip3d_lite.files import digest, read_json, write_text
+from tapip3d_lite.measures import flawed_on_purpose
 from tapip3d_lite.parts import source
 
 Results = dict[str, dict[str, dict[str, dict[str, float]]]]  # label → split → clip → metric → score
 METRICS = ("AJ3D_none", "APD3D_none", "AJ3D", "APD3D", "OA")
 
 
+@flawed_on_purpose()  # poses in `drift`
 def run_benchmark(
     runs: Iterable[tuple[str, TrackerLike, Mapping[str, object]]],
     splits: Sequence[str] = SPLITS,

@@ -26,6 +26,7 @@ from tapip3d_lite.lab.budgets import Budget, Data, judged_clip
 from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.lab.train import make_trainer
 from tapip3d_lite.lab.variant import Variant
+from tapip3d_lite.measures import flawed_on_purpose
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
 from tapip3d_lite.simulate.dataset import leave_interrupts
@@ -119,6 +120,7 @@ def tracker_of(row: Variant, folder: Path | str | None, device: str = "cpu", cus
     return other.to(device).eval()
 
 
+@flawed_on_purpose()
 def score(tracker: TrackerLike, row: Variant, clips: Sequence[Clip]) -> dict[str, dict[str, float | None]]:
     """Scores by clip under the row's condition; None where one is undefined."""
     scores = {}

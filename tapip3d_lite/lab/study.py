@@ -30,6 +30,7 @@ from tapip3d_lite.lab.report import explorer, write_report
 from tapip3d_lite.lab.table import JUDGED, Table, compare, gaps_by_clip
 from tapip3d_lite.lab.train import interruptible
 from tapip3d_lite.lab.variant import Variant
+from tapip3d_lite.measures import flawed_on_purpose
 from tapip3d_lite.training.run_folder import read_log
 from tapip3d_lite.validate import check_names, checked
 
@@ -167,6 +168,7 @@ class Study:
                 logs[name] = read_log(log)
         return write_report(Path(folder), table, results, logs, self.plan.to_dict())
 
+    @flawed_on_purpose()
     def tracks(self, row: str, clip: str, seed: int = 0) -> tuple[Clip, Tracks]:
         """A held-out clip as a row saw it, and the row's tracks; ValueError where these were not scored."""
         found = self.results().get(row, {}).get(seed, {})

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import in_image
+from tapip3d_lite.measures import warn_of_misfit
 from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.config import INTERCHANGEABLE, TrackerConfig
 from tapip3d_lite.model.frames import Frames, crop_clip, frames_from_clip, resize_clip
@@ -82,6 +83,7 @@ def track(
     asked, count = resolve_queries(clip, queries), len(clip)
     clip, shift = near_origin(clip)
     queries = shifted(asked, shift)
+    warn_of_misfit(clip)
     clip = _prepared(clip, tracker.config, crop)
     roi = quantile_roi(torch.from_numpy(clip.depths)) if isinstance(depth_roi, str) else depth_roi
     options = {"iterations": iterations, "space": space, "depth_roi": roi}
