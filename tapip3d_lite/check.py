@@ -191,7 +191,10 @@ def _misfit(clip: Clip) -> list[Finding]:
     def accepted(attempts: list, slack: float, share: float) -> list[Finding]:
         """What is done in the best attempt, if the clip fits then, and much better."""
         _, after, chain = attempts[0] if attempts else (0, before, [])
-        better = before.badness() - after.badness() > -max(len(chain), 1) * np.log(share)
+        many = (
+            1.7 if before.usual() and any(CATALOGUE[step[0]].price > 1 for step in chain) else 1
+        )  # one of many helps by chance
+        better = before.badness() - after.badness() > -many * max(len(chain), 1) * np.log(share)
         return [_found(*step, *_worst(before, after)) for step in chain] if better and after.usual(slack) else []
 
     tried = []
@@ -200,7 +203,7 @@ def _misfit(clip: Clip) -> list[Finding]:
         if found := accepted(attempts, 1.0, _GAIN):
             return found
         tried = sorted([*tried, *attempts], key=lambda attempt: attempt[0])
-    if before.usual(1.3):
+    if not before.doubtful():
         return _displaced(clip)
     if found := accepted(tried, 1.3, _GAIN**0.5):
         return found

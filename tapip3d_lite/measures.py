@@ -37,6 +37,10 @@ class Agreement:
         """Whether good clips have such numbers."""
         return self.depth <= slack * USUAL_DEPTH and self.colour <= slack * USUAL_COLOUR
 
+    def doubtful(self) -> bool:
+        """Whether no good clip has such numbers; where depths agree to a thousandth, poses are right, and colours hardly count."""
+        return not self.usual(1.5 if self.depth > 1e-3 else 3)
+
     def numbers(self) -> str:
         """Both, in words."""
         return (
@@ -94,8 +98,7 @@ def warn_of_misfit(clip: Clip) -> None:
     if len(clip) == 1 or min(clip.size) < 64:  # too little to tell
         return
     found = agreement(reduced(clip), starts=2, count=200)
-    # Where depths agree to a thousandth through poses that move, these are right, whatever is with the colours.
-    if not found.usual(1.3 if found.depth > 1e-3 else 3):
+    if found.doubtful():
         warnings.warn(
             f"clip {clip.name!r} does not fit together: {found.numbers()}; look for the cause with check_clip(clip)",
             stacklevel=4,

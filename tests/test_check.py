@@ -116,7 +116,7 @@ def test_an_unknown_cause_is_said_with_what_is_likeliest(clip):
 def test_the_cheap_part_warns_once_and_only_of_what_does_not_fit(clip):
     warn_of_misfit(clip)
     with pytest.warns(UserWarning, match="does not fit together") as said:
-        warn_of_misfit(MIX_UPS["camera to world"][0](clip))
+        warn_of_misfit(MIX_UPS["OpenGL axes"][0](clip))
     assert len(said) == 1 and str(USUAL_DEPTH) in str(said[0].message) and str(USUAL_COLOUR) in str(said[0].message)
 
 
