@@ -191,9 +191,8 @@ def _misfit(clip: Clip) -> list[Finding]:
     def accepted(attempts: list, slack: float, share: float) -> list[Finding]:
         """What is done in the best attempt, if the clip fits then, and much better."""
         _, after, chain = attempts[0] if attempts else (0, before, [])
-        many = (
-            1.7 if before.usual() and any(CATALOGUE[step[0]].price > 1 for step in chain) else 1
-        )  # one of many helps by chance
+        # Where nothing need be wrong, one of many rare mistakes undone helps by chance.
+        many = 1.7 if before.usual() and any(CATALOGUE[step[0]].price > 1 for step in chain) else 1
         better = before.badness() - after.badness() > -many * max(len(chain), 1) * np.log(share)
         return [_found(*step, *_worst(before, after)) for step in chain] if better and after.usual(slack) else []
 

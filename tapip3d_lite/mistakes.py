@@ -152,9 +152,8 @@ def _estimated(kind: str) -> Callable[[Case], Candidates]:
             return
         given, unit = clip.extrinsics.astype(np.float64), float(np.median(clip.depths[clip.depths > 0]))
         best = np.inf, given, np.zeros((1, 1))
-        for pose in range(
-            len(clip)
-        ):  # of which this one is right; shuffled, it belongs to the first frame; the others follow
+        # One pose is right (shuffled, it belongs to the first frame), and the others follow from it.
+        for pose in range(len(clip)):
             wanted = found @ invert(found[0 if kind == "shuffled" else pose]) @ given[pose]
             off = np.abs((wanted[:, None] - given[None])[..., :3, :] / (1, 1, 1, unit)).max((2, 3))  # (T, T)
             error = np.minimum(off.min(1) if kind == "shuffled" else np.diagonal(off), 0.1).sum()
