@@ -86,15 +86,8 @@ def _far_world(clip: Clip) -> Iterator[Finding]:
     if away[0] > _FAR * away[1] and clip.extrinsics.dtype == np.float32:  # in 64 bits nothing is lost
         message = f"the world's origin is {away[0]:.3g} from the cameras: numbers of 32 bits are rounded to {away[0] * 6e-8:.1g} there"
         remedy = "Subtract one camera's place from all poses and points, in 64 bits, before anything else."
-        yield Finding(
-            "far_world",
-            message,
-            remedy,
-            lambda clip: near_origin(clip)[0],
-            "distance in depths",
-            away[0] / away[1],
-            0.0,
-        )
+        fix, far = lambda clip: near_origin(clip)[0], away[0] / away[1]
+        yield Finding("far_world", message, remedy, fix, "distance in depths", far, 0.0)
 
 
 def _stand_in(clip: Clip) -> Iterator[Finding]:
@@ -106,10 +99,8 @@ def _stand_in(clip: Clip) -> Iterator[Finding]:
     if rest.size and share > 1e-3 and top > 3 * rest.max():
         message = f"{share:.1%} of the depths are {top:.6g}, all others below {rest.max():.3g}: it stands for unknown"
         fix = depths(lambda x: np.where(x < 0.999 * top, x, 0))
-        ratio = float(top / rest.max())
-        yield Finding(
-            "stand_in_depth", message, "Set these depths to 0.", fix, "largest depth over the next", ratio, 1.0
-        )
+        measure = "largest depth over the next", float(top / rest.max()), 1.0
+        yield Finding("stand_in_depth", message, "Set these depths to 0.", fix, *measure)
 
 
 def _normalised(clip: Clip) -> Iterator[Finding]:

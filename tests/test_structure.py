@@ -215,6 +215,13 @@ def test_every_public_name_resolves():
         t3d.nonsense  # noqa: B018
 
 
+def test_an_installed_package_has_all_of_its_files():
+    (line,) = re.findall(r"^tapip3d_lite = (\[.*\])$", (ROOT / "pyproject.toml").read_text(), re.M)
+    packed = {path for pattern in ast.literal_eval(line) for path in PACKAGE.glob(pattern)}
+    ignored = {".pyc", ".py"}
+    assert {path for path in PACKAGE.rglob("*.*") if path.is_file() and path.suffix not in ignored} == packed
+
+
 def test_no_test_module_imports_another():
     for path in (ROOT / "tests").rglob("*.py"):
         assert not re.search(r"^(from|import) tests\.test_", path.read_text(), re.M), path.name
