@@ -234,7 +234,9 @@ def curves(
 
 def lab(
     action: Positional[Annotated[Literal["run", "table", "report", "list"], arg(help="what to do with the study")]],
-    study: Positional[Annotated[str | None, arg(help="TOML or JSON file, folder, or a table of the paper")]] = None,
+    study: Positional[
+        Annotated[str | None, arg(help="TOML or JSON file, folder, a table of the paper, or `paper`")]
+    ] = None,
     /,
     jobs: Annotated[int, arg(help="trainings at once (run)")] = 1,
     device: Annotated[str, arg(help="cpu or cuda (run)")] = "cpu",
@@ -247,12 +249,15 @@ def lab(
     allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
     """Run a study of rows under equal conditions; its table, its report, its rows, or the paper's tables by name."""
-    from tapip3d_lite.lab.papers import TABLES, listed, open_study
+    from tapip3d_lite.lab.papers import TABLES, listed, open_study, report_all
 
     if study is None:
         print("\n".join(f"{name}: {' · '.join(values['rows'])}" for name, values in TABLES.items()))
         return
-    opened, base = open_study(study, accept_code, allow, budget, seeds)
+    if (action, study) == ("report", "paper"):
+        print(f"wrote {report_all(out)}")
+        return
+    opened, base = open_study(study, accept_code, allow, budget, seeds, shipped=action != "run")
     if action == "run" and not opened.run(jobs, device):
         print("stopped and saved; the same command goes on")
         sys.exit(130)

@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from tapip3d_lite import __main__, lab, trackers
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project, unproject
-from tapip3d_lite.lab import jobs, plan
+from tapip3d_lite.lab import jobs, papers, plan
 from tapip3d_lite.lab.budgets import judged_clip
 from tapip3d_lite.lab.claims import judge, with_claims
 from tapip3d_lite.lab.conditions import under
@@ -26,6 +26,7 @@ from tapip3d_lite.training.data import FeatureCache
 from tapip3d_lite.training.examples import Examples
 from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.trainer import Trainer
+from tests import pack_tables
 from tests.lab_conditions import Mean, darker
 from tests.tiny import ROOT
 
@@ -485,6 +486,37 @@ def test_every_table_of_the_paper_runs(name, home, monkeypatch, capsys):
         assert f"| {one} | {' / '.join('–' if x is None else f'{x:.1f}' for x in numbers)} |" in text
     values = json.loads((home / f"runs/{name}, tiny/study.json").read_text())
     assert values["seeds"] == 1 and values["budget"]["held_out"] == 2
+
+
+def test_shipped_tables_are_read_where_none_was_run(home, tmp_path, monkeypatch, capsys):
+    shipped, here = tmp_path / "paper", tmp_path / "here"
+    for module in (papers, pack_tables):
+        monkeypatch.setattr(module, "PAPER", shipped)
+    monkeypatch.setitem(lab.BUDGETS, "tiny", replace(TINY, held_out=2, frames=4, points=8))
+    given = {"rows": {"klt": {"tracker": "klt"}, "n2n": {}}, "against": "klt", "seeds": 1, "budget": "tiny"}
+    for module in (papers, pack_tables):
+        monkeypatch.setattr(
+            module, "TABLES", {"n2n": given, "blur": {"rows": {"klt": {"tracker": "klt"}}, "against": "klt"}}
+        )
+    monkeypatch.chdir(home)
+    mine = call(monkeypatch, capsys, "run", "n2n")
+    pack_tables.main()
+    assert "blur: left out, no scores of klt" in capsys.readouterr().out
+    here.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(plan, "source_code", dict)  # read by a later version of the code …
+    recipe = json.loads((shipped / "n2n/study.json").read_text())
+    del recipe["budget"]["recipe"]["precision"]  # … that has fields that the older one lacked
+    (shipped / "n2n/study.json").write_text(json.dumps(recipe))
+    assert call(monkeypatch, capsys, "table", "n2n") == mine
+    before = {path: path.read_bytes() for path in shipped.rglob("*") if path.is_file()}
+    made, _ = open_study("n2n", shipped=True)
+    clip = next(iter(made.results()["n2n"][0]["scores"]))
+    assert made.tracks("n2n", clip)[1].xyz.shape[0] == 4
+    assert "wrote" in call(monkeypatch, capsys, "report", "paper", "--out", "all")
+    assert "Without results yet: blur." in (here / "all/report.md").read_text()
+    assert "minus klt" in (here / "all/n2n/report.md").read_text()
+    assert before == {path: path.read_bytes() for path in shipped.rglob("*") if path.is_file()}
 
 
 def scored(level, trained=True, seeds=3):

@@ -114,14 +114,18 @@ class Data:
 
 def simulated(folder: Path, budget: Budget, workers: int, progress: bool) -> Data:
     """The clips of a budget; missing ones are simulated."""
+    recipe, options = budget.recipe, (budget, workers, progress)
+    watched = _made(folder / "watched", recipe.validation, VALIDATION, *options)
+    return Data(_made(folder / "train", recipe.clips, TRAINING, *options), watched, judged_by(folder, *options))
 
-    def made(name: str, count: int, seeds: range) -> tuple[Path, ...]:
-        options = (budget.scene, seeds.start, workers, progress)
-        return tuple(simulate_dataset(folder / name, count, *options)) if count else ()
 
-    recipe = budget.recipe
-    watched = made("watched", recipe.validation, VALIDATION)
-    return Data(made("train", recipe.clips, TRAINING), watched, made("held_out", budget.held_out, STUDIES))
+def judged_by(folder: Path, budget: Budget, workers: int = 1, progress: bool = False) -> tuple[Path, ...]:
+    """The clips of a budget that rows are judged by; missing ones are simulated."""
+    return _made(folder / "held_out", budget.held_out, STUDIES, budget, workers, progress)
+
+
+def _made(folder: Path, count: int, seeds: range, budget: Budget, *options: Any) -> tuple[Path, ...]:
+    return tuple(simulate_dataset(folder, count, budget.scene, seeds.start, *options)) if count else ()
 
 
 def judged_clip(path: Path, budget: Budget) -> Clip:

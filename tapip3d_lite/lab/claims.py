@@ -16,6 +16,7 @@ from tapip3d_lite.lab.statistics import verdicts
 from tapip3d_lite.lab.table import TITLES, Results, Table, difference, shown
 
 METRICS = ("AJ3D", "APD3D", "OA")
+CLAIM_HEAD = ("claim", "metric", "paper, %", "ours, %", "verdict")
 
 
 def with_claims(table: Table, results: Results, paper: Mapping[str, Any]) -> Table:
@@ -28,15 +29,20 @@ def with_claims(table: Table, results: Results, paper: Mapping[str, Any]) -> Tab
     text = f"The paper's numbers ({' / '.join(METRICS)}, %; {paper['source']}) and claims, beside ours:"
     rows = [[name, " / ".join("–" if x is None else f"{x:.1f}" for x in one)] for name, one in paper["rows"].items()]
     parts = [text, markdown_table(["row", "paper"], rows)]
+    if claims:
+        parts.append(markdown_table(CLAIM_HEAD, claim_cells(claims)))
+    return replace(table, claims=claims, notes=[*parts, *table.notes])
+
+
+def claim_cells(claims: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Claims as rows of a Markdown table under `CLAIM_HEAD`."""
     cells = []
     for claim in claims:
         a, b = claim["paper"]
         ours = shown({name: 100 * value for name, value in claim["ours"].items()}, "+", 1)
         pair = f"{claim['row']} minus {claim['against']}"
         cells.append([pair, TITLES.get(claim["metric"], claim["metric"]), f"{a - b:+.1f}", ours, claim["verdict"]])
-    if cells:
-        parts.append(markdown_table(["claim", "metric", "paper, %", "ours, %", "verdict"], cells))
-    return replace(table, claims=claims, notes=[*parts, *table.notes])
+    return cells
 
 
 def judge(results: Results, paper: Mapping[str, Any], metrics: Sequence[str]) -> list[dict[str, Any]]:

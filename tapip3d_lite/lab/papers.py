@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tapip3d_lite.files import read_json
+from tapip3d_lite.evaluation.evaluate import markdown_table
+from tapip3d_lite.files import read_json, write_text
+from tapip3d_lite.lab.claims import CLAIM_HEAD, claim_cells
 from tapip3d_lite.lab.study import Study
 from tapip3d_lite.lab.variant import Variant
 from tapip3d_lite.validate import check_names
@@ -135,6 +137,7 @@ TABLES: dict[str, dict[str, Any]] = {
 """The paper's tables: `rows` by name, each with the arguments of `Variant`; `against`, `paper` (see `claims.with_claims`),
 and other arguments of `Study`. The paper's numbers are AJ3D, APD3D and OA; a row whose numbers are not at hand has none."""
 
+PAPER = Path(__file__).parent / "paper"  # the tables' results, and weights of one seed, as they are shipped
 _FIELDS = ("folder", "rows", "against", "seeds", "budget", "steps", "minutes", "store")
 
 
@@ -144,12 +147,14 @@ def open_study(
     parts: Sequence[Any] = (),
     budget: str | None = None,
     seeds: int | None = None,
+    shipped: bool = False,
 ) -> tuple[Study, str | None]:
     """A study, and the row that others are compared with, from a name of `TABLES`, a TOML or JSON file, or a folder.
 
     A file's `folder` and `store` are relative to it; without a `folder` the study is in `runs/<name>`. Custom parts that
     files name must be among `parts`, as for `load_tracker`. Another `budget` (which gets a folder of its own) or number
-    of `seeds` than the study's can be asked for.
+    of `seeds` than the study's can be asked for. `shipped`: a table of the paper that has no folder in `runs` yet is the one
+    that the library brings along, to be read, not run.
 
     Raises:
         ValueError: neither of these, an unreadable file, unknown fields, or what `Study` refuses.
@@ -159,9 +164,12 @@ def open_study(
         return Study(path, seeds=seeds, budget=budget, accept_code=accept_code, parts=parts), None
     if path.suffix not in (".toml", ".json"):
         check_names("lab: no file (.toml, .json), no study's folder, no table of the paper", [str(source)], TABLES)
-        values, home = TABLES[str(source)], Path()
-        values = {"store": "runs/store", **values}
+        values, home = {"store": "runs/store", **TABLES[str(source)]}, Path()
         paper = values.pop("paper", None)
+        if shipped and not (Path("runs") / path / "study.json").exists() and (PAPER / path / "study.json").exists():
+            study = Study(PAPER / path, store=PAPER / "store", accept_code=True)
+            study.paper, study.plan.settled = paper, True
+            return study, values["against"]
     else:
         values, home = _parsed(path), path.parent
     check_names(str(source), values, _FIELDS)
@@ -180,6 +188,25 @@ def open_study(
     study = Study(folder, rows, **kept, accept_code=accept_code, parts=parts)
     study.paper = paper
     return study, values.get("against")
+
+
+def report_all(folder: Path) -> Path:
+    """Write the reports of all tables of the paper that have results, and a page of what became of its claims."""
+    rows, left = [], []
+    for name in TABLES:
+        study, against = open_study(name, accept_code=True, shipped=True)
+        if not any("scores" in one for seeds in study.results().values() for one in seeds.values()):
+            left.append(name)
+            continue
+        study.report(folder / name, against)
+        rows += [[f"[{name}]({name}/report.md)", *cells] for cells in claim_cells(study.table(against).claims)]
+    if len(left) == len(TABLES):
+        raise ValueError("lab: no table of the paper has results yet; run one, e.g. `lab run n2n`")
+    done = ", ".join(f"[{name}]({name}/report.md)" for name in TABLES if name not in left)
+    parts = ["# The paper's claims", markdown_table(["table", *CLAIM_HEAD], rows), f"All tables: {done}."]
+    parts += [f"Without results yet: {', '.join(left)}."] if left else []
+    write_text(folder / "report.md", "\n\n".join(parts) + "\n")
+    return folder / "report.md"
 
 
 def _parsed(path: Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import quote
 
 from tapip3d_lite.files import digest, read_json, write_text
-from tapip3d_lite.lab.budgets import Budget, Data, simulated
+from tapip3d_lite.lab.budgets import Budget, Data, judged_by, simulated
 from tapip3d_lite.lab.jobs import Job
 from tapip3d_lite.lab.provenance import diff, own_code, source_code
 from tapip3d_lite.lab.variant import Variant
@@ -38,6 +38,7 @@ class Plan:
         budget: what rows have in common.
         code: digests of the sources.
         clips: digests of the clips, once there are some.
+        settled: results count as they are, whatever the code that made them was.
     """
 
     folder: Path
@@ -47,6 +48,7 @@ class Plan:
     budget: Budget
     code: dict[str, str] = field(default_factory=source_code)
     clips: dict[str, str] | None = None
+    settled: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as `study.json` holds them."""
@@ -68,6 +70,7 @@ class Plan:
     def take_over(self, old: Mapping[str, Any], accept_code: bool) -> None:
         """Refuse (ValueError) an old plan that differs in what must be equal; take over what it knows."""
         ours, rows = self.to_dict(), [name for name in self.rows if name in old["rows"]]
+        old = {**old, "budget": {**old["budget"], "recipe": TrainConfig.complete(old["budget"]["recipe"])}}
         if found := diff(*({"budget": x["budget"], "rows": {n: x["rows"][n] for n in rows}} for x in (old, ours))):
             text = ", ".join(f"{name}={a!r} (now {b!r})" for name, (a, b) in found.items())
             raise ValueError(f"Study: {self.folder} was made otherwise: {text}; use its values, other names or folders")
@@ -89,14 +92,31 @@ class Plan:
 
     def find_clips(self, processes: int, progress: bool) -> Data:
         """The clips, simulated where they are missing; ValueError where an old study had others."""
-        data = simulated(self.store / "clips" / self.budget.scene.__name__, self.budget, processes, progress)
-        found = {name: digest(*(path.read_bytes() for path in paths)) for name, paths in asdict(data).items()}
-        if self.clips not in (None, found):
-            changed = ", ".join(diff(self.clips, found))
-            raise ValueError(f"Study: clips ({changed}) differ from those of {self.folder}; use another folder")
-        self.clips = found
+        data = simulated(self._clips, self.budget, processes, progress)
+        self.clips = self._unchanged(**asdict(data))
         self.save()
         return data
+
+    def judged(self) -> tuple[Path, ...]:
+        """The clips that rows are judged by, as from `find_clips`."""
+        held_out = judged_by(self._clips, self.budget)
+        if not self.settled:  # another machine's last digits may differ, and only what is drawn depends on them
+            self._unchanged(held_out=held_out)
+        return held_out
+
+    @property
+    def _clips(self) -> Path:
+        """Where clips are; what is shipped has none, and its folder may not be writable."""
+        return (Path("runs/store") if self.settled else self.store) / "clips" / self.budget.scene.__name__
+
+    def _unchanged(self, **clips: tuple[Path, ...]) -> dict[str, str]:
+        """Their digests; ValueError where an old study had others."""
+        found = {name: digest(*(path.read_bytes() for path in paths)) for name, paths in clips.items()}
+        if changed := [name for name in found if found[name] != (self.clips or found)[name]]:
+            raise ValueError(
+                f"Study: clips ({', '.join(changed)}) differ from those of {self.folder}; use another folder"
+            )
+        return found
 
     def recipe(self, row: Variant, seed: int = 0) -> TrainConfig:
         """What is trained for a row and seed, given an encoder."""
@@ -156,9 +176,9 @@ class Plan:
         """What the files of results hold, by row and seed, without those of an earlier state of the row."""
         found = {}
         for name, row in self.rows.items():
-            files = {s: file for s in range(self.seeds) if (file := self.result(row, s)).exists()}
-            held = {s: read_json(file) for s, file in files.items()}
-            found[name] = {s: x for s, x in held.items() if x["key"] == self._key(row, self._training(row, s))}
+            held = {s: read_json(file) for s in range(self.seeds) if (file := self.result(row, s)).exists()}
+            ours = {s: self.settled or x["key"] == self._key(row, self._training(row, s)) for s, x in held.items()}
+            found[name] = {s: x for s, x in held.items() if ours[s]}
         return found
 
 

@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures.comparisons import where_they_differ
 from tapip3d_lite.files import read_json, write_text
-from tapip3d_lite.lab.budgets import BUDGETS, Budget, Data, judged_clip
+from tapip3d_lite.lab.budgets import BUDGETS, Budget, judged_clip
 from tapip3d_lite.lab.claims import with_claims
 from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.lab.jobs import STOPPED, Job, do_all, tracker_of
@@ -93,7 +93,6 @@ class Study:
         store = Path(store) if store else folder / "store"
         self.plan = Plan(folder, store, dict(zip(names, rows, strict=True)), seeds, budget)
         self.plan.check_rows()
-        self._data: Data | None = None
         self.paper: dict[str, Any] | None = None  # what it says of these rows, see `claims`
         if old is not None:
             self.plan.take_over(old, accept_code)
@@ -174,8 +173,7 @@ class Study:
         found = self.results().get(row, {}).get(seed, {})
         if clip not in found.get("scores", {}):
             raise ValueError(f"Study: row {row!r} has no scores of {clip!r} with seed {seed}; run the study first")
-        self._data = self._data or self.plan.find_clips(1, False)
-        index, path = next((i, path) for i, path in enumerate(self._data.held_out) if path.stem == clip)
+        index, path = next((i, path) for i, path in enumerate(self.plan.judged()) if path.stem == clip)
         variant, training = self.plan.rows[row], found["training"] and self.plan.store / "trainings" / found["training"]
         seen = under(judged_clip(path, self.plan.budget), variant.degrade, index)
         custom = [] if training is None else self.plan.recipe(variant).custom
