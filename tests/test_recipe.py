@@ -12,6 +12,7 @@ import tapip3d_lite as t3d
 from tapip3d_lite.training import schedule as clock
 from tapip3d_lite.training.data import make_batch
 from tapip3d_lite.training.loss import LossConfig, accuracy, step_accuracy
+from tapip3d_lite.training.optimizers import hidden_matrices, make_optimizer
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.pretrain import MatchingConfig
 from tapip3d_lite.training.recipe import TrainConfig
@@ -257,3 +258,41 @@ def test_a_training_with_a_time_budget_ends_with_it_and_continues(tmp_path, clip
     assert checkpoint(tmp_path).keys() == second.tracker.state_dict().keys()
     with pytest.raises(ValueError, match="minutes"):
         recipe(minutes=0)
+
+
+def test_muon_takes_the_matrices_inside_blocks_and_steps_as_far_as_adamw():
+    """AdamW's first step moves each number by the learning rate; Muon's a number by 0.2 of it, as later ones of AdamW."""
+    torch.manual_seed(0)
+    tracker = t3d.Tracker(t3d.TrackerConfig.preset("lite", **SIZES))
+    names = {id(p): name for name, p in tracker.named_parameters()}
+    hidden = {names[id(p)] for p in hidden_matrices(tracker)}
+    assert {"updater.time.0.attention.to_q.weight", "updater.time.0.mlp.0.weight"} <= hidden
+    assert not [name for name in hidden if "head" in name or "input" in name or "encoder" in name or "bias" in name]
+    pair = make_optimizer(tracker, list(tracker.parameters()), "muon", 1e-2, 0.0, False)
+    assert len(pair.param_groups) == 3
+    assert sum(len(group["params"]) for group in pair.param_groups) == len(names)
+    before = {name: p.detach().clone() for name, p in tracker.named_parameters()}
+    for p in tracker.parameters():
+        p.grad = torch.randn_like(p)
+    pair.step()
+    for name, p in tracker.named_parameters():
+        length = (p.detach() - before[name]).square().mean().sqrt().item() / 1e-2
+        assert length == pytest.approx(0.2 if name in hidden else 1.0, rel=0.25), name
+    pair.zero_grad()
+    assert all(p.grad is None for p in tracker.parameters())
+    assert isinstance(make_optimizer(nn.Linear(2, 2), [], "muon", 1e-2, 0.0, False), torch.optim.AdamW)
+
+
+def test_a_training_with_muon_continues_exactly(tmp_path, clips, one_thread):
+    change = recipe(optimizer="muon")
+    assert Trainer(tmp_path / "whole", change, clips).run(progress=False)
+    for _ in range(2):
+        stop = iter([False] * 5 + [True]).__next__
+        Trainer(tmp_path / "halted", change, clips, resume=True).run(stop, progress=False)
+    assert Trainer(tmp_path / "halted", change, clips, resume=True).run(progress=False)
+    whole, halted = checkpoint(tmp_path / "whole"), checkpoint(tmp_path / "halted")
+    assert all(torch.equal(whole[name], halted[name]) for name in whole)
+    other = Trainer(tmp_path / "adamw", recipe(), clips)
+    assert other.run(progress=False) and any(
+        not torch.equal(x, whole[name]) for name, x in checkpoint(tmp_path / "adamw").items()
+    )

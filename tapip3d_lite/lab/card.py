@@ -13,6 +13,7 @@ from tapip3d_lite.training.augment import augmentations
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.run_folder import read_log
 
+_NAMES = {"adamw": "AdamW", "muon": "Muon and AdamW"}
 _PARTS = {"All points": "", "Moving points": "_dynamic", "Points at rest": "_static"}
 _LIMITS = """- Trained on simulated clips of rigid bodies in rooms, at most {frames} frames an example and images of {size}
   pixels; on real footage, soft bodies or much longer clips this card measures nothing.
@@ -93,7 +94,7 @@ def _facts(config: TrainConfig, log: list[dict], weights: Path, hardware: str, p
         "data": f"{config.clips} simulated clips; examples of {_range(config.frames)} frames and {config.sampling.tracks} "
         f"tracks; images {_changes(config)}; a poor sensor in {config.sensor:.0%}, wrong poses in {config.motion.wrong:.0%}",
         "steps": _steps(config, log),
-        "recipe": f"AdamW {config.lr:g}, weight decay {config.weight_decay:g}, one cycle, M = {_range(config.iterations)}, "
+        "recipe": f"{_NAMES[config.optimizer]} {config.lr:g}, weight decay {config.weight_decay:g}, one cycle, M = {_range(config.iterations)}, "
         f"{config.precision}, encoder {'trained along' if config.train_encoder else 'frozen after matching'}, seed {config.seed}",
         "wall-clock": f"{last['seconds'] / 3600:.2f} h of steps (evaluations and simulation not counted)",
         "hardware": hardware,

@@ -19,8 +19,9 @@ from tapip3d_lite.training.augment import AugmentConfig
 from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.loss import FORMS, LossConfig
 from tapip3d_lite.training.motion import MotionConfig
+from tapip3d_lite.training.optimizers import OPTIMIZERS
 from tapip3d_lite.training.pretrain import MatchingConfig
-from tapip3d_lite.validate import check_range, check_state, check_types
+from tapip3d_lite.validate import check_names, check_range, check_state, check_types
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ class TrainConfig:
         short: share of the steps, at the start, with the fewest frames and updates: they teach to leave zero motion;
             later steps teach to continue from good estimates, as later updates and windows must.
         train_encoder: train the encoder too; otherwise its features are stored in files, and a step costs half.
-        lr, weight_decay, warmup, clip_norm: of AdamW with one cosine cycle (paper: 5e-4, 5e-4, 0.05, 10).
+        optimizer: `"adamw"`, the paper's, or `"muon"` for the matrices inside blocks, beside AdamW for all else.
+        lr, weight_decay, warmup, clip_norm: of its one cosine cycle (paper: 5e-4, 5e-4, 0.05, 10).
         precision: `"float32"`, or `"bfloat16"` for autocast.
         average: the weights that are scored and saved are an exponential average over so many steps, or over a tenth of
             the steps done where that is less; 0: the last weights.
@@ -76,6 +78,7 @@ class TrainConfig:
     iterations: tuple[int, int] = (2, 3)
     short: float = 0.35
     train_encoder: bool = False
+    optimizer: str = "adamw"
     lr: float = 1e-3
     weight_decay: float = 5e-4
     warmup: float = 0.05
@@ -111,6 +114,7 @@ class TrainConfig:
         check_range(self, 0, 1, "short", "sensor")
         if self.minutes is not None and self.minutes <= 0:
             raise ValueError(f"TrainConfig.minutes: expected a positive time or None, got {self.minutes}")
+        check_names("TrainConfig.optimizer", [self.optimizer], OPTIMIZERS)
         if self.precision not in ("float32", "bfloat16"):
             raise ValueError(f'TrainConfig.precision: expected "float32" or "bfloat16", got {self.precision!r}')
         check_range(self, 1e-12, 1e3, "lr")

@@ -1,4 +1,4 @@
-"""`Schedule`: how far a training has come, by its number of steps or by the clock, and what follows from that; AdamW.
+"""`Schedule`: how far a training has come, by its number of steps or by the clock, and what follows from that.
 
 Paper: appendix (training): one cosine cycle up to 5e-4, with 5 % of the steps for the warm-up; weight decay 5e-4 except
 for biases and norms.
@@ -9,10 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterator, Sequence
-
-import torch
-from torch import nn
+from collections.abc import Iterator
 
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.pretrain import MatchingConfig
@@ -95,10 +92,3 @@ def one_cycle(position: float, steps: int, peak: float, warmup: float) -> tuple[
 
 def _cosine(start: float, end: float, share: float) -> float:
     return end + (start - end) / 2.0 * (math.cos(math.pi * share) + 1)
-
-
-def adamw(parameters: Sequence[nn.Parameter], lr: float, weight_decay: float, fused: bool) -> torch.optim.AdamW:
-    """AdamW that does not decay biases and the parameters of norms, which are vectors; `fused` in one kernel (GPU)."""
-    vectors, others = [p for p in parameters if p.ndim < 2], [p for p in parameters if p.ndim >= 2]
-    groups = [{"params": others, "weight_decay": weight_decay}, {"params": vectors, "weight_decay": 0.0}]
-    return torch.optim.AdamW(groups, lr, fused=fused or None)

@@ -27,11 +27,12 @@ from tapip3d_lite.training.backward import add_gradients, losses
 from tapip3d_lite.training.data import Batch, FeatureCache
 from tapip3d_lite.training.examples import Examples, check_clips
 from tapip3d_lite.training.loss import accuracy, step_accuracy
+from tapip3d_lite.training.optimizers import make_optimizer
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.pretrain import FramePair, matching_loss, take_encoder
 from tapip3d_lite.training.recipe import TrainConfig, initial_weights
 from tapip3d_lite.training.run_folder import Bar, RunFolder
-from tapip3d_lite.training.schedule import Schedule, adamw
+from tapip3d_lite.training.schedule import Schedule
 from tapip3d_lite.validate import check_state
 
 
@@ -171,7 +172,7 @@ class Trainer:
             raise FloatingPointError(self.folder.save_failure(line, norm, self._drawn))
         lr, beta1 = self.schedule.rate()
         for group in self.optimizer.param_groups:
-            group |= {"lr": lr, "betas": (beta1, group["betas"][1])}
+            group |= {"lr": lr} | ({"betas": (beta1, group["betas"][1])} if "betas" in group else {})
         self.optimizer.step()
         if not np.isfinite(float(nn.utils.get_total_norm([p.detach() for p in self.parameters]))):
             raise FloatingPointError(self.folder.save_failure(line, norm, self._drawn))
@@ -234,7 +235,8 @@ class Trainer:
         self.parameters = [p for p in self.tracker.parameters() if p.requires_grad]
         fast = None if matching else fast_step(self.device, self.config.custom)
         self._replay = None if fast is None else fast(self._add_gradients, self.tracker, self.parameters)
-        self.optimizer = adamw(self.parameters, recipe.lr, recipe.weight_decay, fused=self._on_gpu)
+        kind, rates = "adamw" if matching else self.config.optimizer, (recipe.lr, recipe.weight_decay)
+        self.optimizer = make_optimizer(self.tracker, self.parameters, kind, *rates, fused=self._on_gpu)
         if saved is not None:
             self.optimizer.load_state_dict(saved["optimizer"])
 
