@@ -193,10 +193,10 @@ def _misfit(clip: Clip) -> list[Finding]:
         if found := accepted(attempts, 1.0, _GAIN):
             return found
         tried = sorted([*tried, *attempts], key=lambda attempt: attempt[0])
+    if not before.usual(1.3) and (found := accepted(tried, 1.3, _GAIN**0.5)):
+        return found
     if not before.doubtful():
         return _displaced(clip)
-    if found := accepted(tried, 1.3, _GAIN**0.5):
-        return found
     likely = ", ".join(list(dict.fromkeys("+".join(step[0] for step in chain) for *_, chain in tried))[:3])
     message = f"inconsistent: {before.numbers()}; cause unknown, likeliest: {likely or 'none'}"
     remedy = "Compare poses, intrinsics, depth and their order with where they come from; much motion does that, too."
