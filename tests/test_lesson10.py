@@ -62,13 +62,15 @@ def test_an_error_map_is_a_loops(source):
         for u in range(width):
             z = float(source.depths[t, v, u])
             if z > 0:
-                p = transform(transform(z * np.linalg.inv(lens) @ [u, v, 1], invert(e))[None], e_s)[0]
+                ray = np.linalg.inv(lens) @ [u, v, 1]
+                p = transform(transform(z * ray[None], invert(e)), e_s)[0]
                 column, row = np.rint((lens @ p / p[2])[:2]).astype(int)
                 if p[2] > 0 and 0 <= column < width and 0 <= row < height and source.depths[s, row, column] > 0:
                     by_loop[v, u] = abs(p[2] / source.depths[s, row, column] - 1)
-    np.testing.assert_allclose(errors, by_loop, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(errors, by_loop, rtol=1e-6, atol=1e-7)
     assert n10.misfit(source, 3) < 0.05 < n10.misfit(replace(source, depths=1 / np.maximum(source.depths, 0.1)), 8)
-    assert n10.misfit(replace(source, depths=0 * source.depths), 3) == 1.0  # nothing fits with nothing
+    alone = np.where(np.arange(len(source))[:, None, None] == 0, source.depths, 0)
+    assert n10.misfit(replace(source, depths=alone), 3) == 1.0  # nothing to compare with
 
 
 def test_fingerprints_show_what_each_mistake_changes(source):
@@ -123,7 +125,7 @@ def test_step_errors_are_those_that_were_made(source):
     poses[5:] = turn @ poses[5:]
     degrees, metres = n10.step_errors(replace(source, extrinsics=poses, queries=None, tracks=None), source)
     assert degrees.argmax() == metres.argmax() == 4 and degrees[4] == pytest.approx(2, abs=0.01)
-    assert degrees[3] < 0.05  # before it nothing has changed
+    assert degrees[3] < 1e-3  # before it nothing has changed
     np.testing.assert_allclose(n10.places(source), invert(source.extrinsics)[:, :3, 3], atol=1e-5)
 
 
@@ -163,7 +165,7 @@ def test_the_milestone_notices_what_is_not_the_librarys():
         assert check(exercise.name, lambda *case, right=exercise.reference: right(*case)).status == "passed"
     said = n10.milestone("10", tracker="static")
     assert said.status == "passed" and "yours" in said.message
-    told = ("thousand", "the one before", "turned", "no check", "not aligned")
+    told = ("thousand", "no limit", "turned", "no check", "not aligned")
     for exercise, slip in zip(n10.EXERCISES, told, strict=True):
         mistake = next(m for m in exercise.mistakes if m.name == slip)
         progress.record(exercise.name, mistake.answer, "passed")

@@ -25,7 +25,17 @@ from lessons.n10_figures import (
     sources_figure,
 )
 from lessons.n10_folder import LATE, SCALE, listing, stamps, stored, write_recording
-from lessons.n10_measure import SUSPECTS, error_map, fingerprint, misfit, places, planted, step_errors, undone, without_points
+from lessons.n10_measure import (
+    SUSPECTS,
+    error_map,
+    fingerprint,
+    misfit,
+    places,
+    planted,
+    step_errors,
+    undone,
+    without_points,
+)
 from lessons.n10_sources import (
     BASELINE,
     SHARE,
@@ -148,7 +158,13 @@ def _numbers(tracker: str) -> Array:
     depth = t3d.stereo_depth(two.video, two.extras["video_right"], two.intrinsics, BASELINE)
     measured = [misfit(clip, gap) for gap in (1, 3)]
     return np.concatenate(
-        [clip.depths.ravel(), tracks.xyz.ravel(), depth.ravel(), measured, [n10_measure.path_error(places(found), places(clip))]]
+        [
+            clip.depths.ravel(),
+            tracks.xyz.ravel(),
+            depth.ravel(),
+            measured,
+            [n10_measure.path_error(places(found), places(clip))],
+        ]
     )
 
 

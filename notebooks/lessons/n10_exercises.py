@@ -68,8 +68,8 @@ def _times(rng: np.random.Generator, size: int) -> tuple:
     colour = 1305031102.0 + np.arange(count) / 30 + rng.uniform(0, 0.002, count)
     depth = colour + rng.uniform(-0.012, 0.012, count)
     depth = np.delete(depth, rng.integers(1, count - 1, 1 + size // 2))
-    depth = np.sort(np.concatenate([depth, depth[:2] + 0.009, colour[-1:] + 0.2]))
-    return colour, depth, 0.02
+    depth = np.sort(np.concatenate([depth, depth[:2] + 0.009, colour[-1:] + 0.2, [1305031200 + 1 / 64]]))
+    return np.append(colour, 1305031200.0), depth, 1 / 64  # the last two are not less than that apart
 
 
 _PARTNERS_HINTS = {
@@ -119,18 +119,18 @@ def carried(depth: Array, other: Array, lens: Array, pose: Array, other_pose: Ar
 
 
 def _frames(rng: np.random.Generator, size: int) -> tuple:
-    """Uneven depth with holes; one of three times the other camera stands in the midst of the points."""
+    """Uneven depth with holes; the other camera stands near the first, in the midst of the points, or behind the first."""
     shape = 5 + size, 7 + 2 * size
-    depth, other = (np.where(rng.random(shape) < 0.15, 0, rng.uniform(1.5, 4, shape)) for _ in range(2))
+    depth, other = (np.where(rng.random(shape) < 0.15, 0, rng.uniform(0.5, 4, shape)) for _ in range(2))
     lens = np.array([[6.0 + size, 0, shape[1] / 2 - 0.7], [0, 6.5 + size, shape[0] / 2 - 0.4], [0, 0, 1]])
-    poses = []
+    poses, ahead = [], rng.choice([0, -2.2, 1.5])
     for i in range(2):
         axis = rng.normal(size=3)
         x, y, z = 0.2 * axis / np.linalg.norm(axis)
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         pose = np.eye(4)
         pose[:3, :3] += np.sin(0.2) / 0.2 * cross + (1 - np.cos(0.2)) / 0.04 * cross @ cross
-        pose[:3, 3] = rng.uniform(-0.4, 0.4, 3) - (0, 0, 2.2 * (i == 1 and rng.random() < 1 / 2))
+        pose[:3, 3] = rng.uniform(-0.3, 0.3, 3) + (0, 0, i * ahead)
         poses.append(pose)
     return depth, other, lens, *poses
 
@@ -157,7 +157,7 @@ def stereo(left: Array, right: Array, focal: float, baseline: float, slip: str =
 
     Pixel u of the left image lies at u - left[v, u] in the right one, and must be sent back within one pixel.
     """
-    height, width = left.shape
+    width = left.shape[1]
     v, u = np.indices(left.shape)
     step = -left if slip != "other way" else left
     source = (np.floor if slip == "floor" else np.rint)(u + step).astype(int)
@@ -191,6 +191,7 @@ def _disparities(rng: np.random.Generator, size: int) -> tuple:
                 right[v, there] = left[v, u] + rng.uniform(-0.8, 0.8)
     left[rng.random(left.shape) < 0.1], right[rng.random(right.shape) < 0.05] = 0, 0
     left[0, 5], right[0, 5] = 0, 0  # unknown on both sides
+    left[1, 6], right[1, 4] = 2, 3  # one pixel apart, no more
     return left, right, float(rng.uniform(50, 300)), float(rng.uniform(0.05, 0.4))
 
 

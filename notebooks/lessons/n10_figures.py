@@ -22,7 +22,9 @@ _DEPTHS = matplotlib.colormaps["viridis_r"].with_extremes(bad="#b8b8b8")
 
 def errors_figure(image: Array, maps: Mapping[str, Array], title: str) -> Figure:
     """A frame, and for each entry the relative errors (H, W) of its pixels in another frame; grey: nothing to compare."""
-    figure = Figure(figsize=(3.4 * (len(maps) + 1) + 0.6, 3.4 * image.shape[0] / image.shape[1] + 0.3), layout="constrained")
+    figure = Figure(
+        figsize=(3.4 * (len(maps) + 1) + 0.6, 3.4 * image.shape[0] / image.shape[1] + 0.3), layout="constrained"
+    )
     first, *rest = figure.subplots(1, len(maps) + 1)
     draw_image(first, image, title)
     for ax, (name, errors) in zip(rest, maps.items(), strict=True):

@@ -105,5 +105,5 @@ def step_errors(clip: Clip, truth: Clip) -> tuple[np.ndarray, np.ndarray]:
     """How far the camera's motion from frame to frame is off: degrees (T - 1,), and metres (T - 1,)."""
     one, two = (x.extrinsics.astype(np.float64) for x in (clip, truth))
     off = (one[1:] @ invert(one[:-1])) @ invert(two[1:] @ invert(two[:-1]))
-    cosine = np.clip((np.trace(off[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)
-    return np.degrees(np.arccos(cosine)), np.linalg.norm(off[:, :3, 3], axis=-1)
+    sine = np.linalg.norm(off[:, :3, :3] - np.eye(3), axis=(1, 2)) / 8**0.5  # of half the angle; exact for small ones
+    return np.degrees(2 * np.arcsin(np.minimum(sine, 1))), np.linalg.norm(off[:, :3, 3], axis=-1)
