@@ -33,7 +33,7 @@ _PARTS = {
     "loss, training": ("06", 7, 1.5),
     "scores\nAJ, APD, OA": ("07", 7, -0.6),
 }
-_ALSO = {"09": ("03", "04", "05", "06")}  # a lesson about the parts of others
+_ALSO = {"09": ("03", "04", "05", "06"), "10": ("00", "02")}  # lessons about the parts of others
 _ARROWS = [(0, 1), (0, 2), (2, 3), (1, 4), (3, 4), (4, 5), (5, 6), (6, 7), (7, 8), (8, 9), (8, 10)]
 
 
@@ -76,7 +76,7 @@ def image(figure: Figure, alt: str) -> str:
 
 
 def pipeline(lesson: str) -> Shown:
-    """The method as a map, from RGB-D frames to tracks, with the part of a lesson (`"00"` to `"09"`) lit."""
+    """The method as a map, from RGB-D frames to tracks, with the part of a lesson (`"00"` to `"10"`) lit."""
     names = list(_PARTS)
     figure = Figure(figsize=(10.2, 2.3), layout="constrained")
     ax = figure.subplots()
