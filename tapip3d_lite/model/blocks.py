@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 DEGREES = tuple(range(-2, 14))
+gradient_degree: int | None = None  # trial: finer features give no gradient
 _SCALES = tuple(2.0**degree for degree in DEGREES)
 FACTOR = 1 + 2 * len(DEGREES)  # outputs per input: 33
 
@@ -32,7 +33,12 @@ def fourier(x: Tensor) -> Tensor:
     reproduce its numbers.
     """
     scales = constant(_SCALES, x)
-    angles = (x.unsqueeze(-2) * scales[:, None]).flatten(-2)  # (..., 16, d) -> (..., 16 d)
+    if gradient_degree is not None and x.requires_grad:
+        rough = gradient_degree - DEGREES[0] + 1
+        parts = x.unsqueeze(-2) * scales[:rough, None], x.detach().unsqueeze(-2) * scales[rough:, None]
+        angles = torch.cat(parts, -2).flatten(-2)
+    else:
+        angles = (x.unsqueeze(-2) * scales[:, None]).flatten(-2)  # (..., 16, d) -> (..., 16 d)
     return torch.cat([x, torch.sin(torch.cat([angles, angles + math.pi / 2], -1))], -1)  # (..., 33 d)
 
 
@@ -59,6 +65,7 @@ class Attention(nn.Module):
         self.to_q = nn.Linear(width, inner, bias)
         self.to_kv = nn.Linear(width, 2 * inner, bias)
         self.to_out = nn.Linear(inner, width)
+        self.register_parameter("table", None)  # trial: (heads, 2 S - 1), bias for each distance in time
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor | None = None) -> Tensor:
         """Let x (..., Q, D) attend to context (..., M, D), whose leading dimensions broadcast against those of x.
@@ -70,6 +77,10 @@ class Attention(nn.Module):
         q, k, v = (y.expand(*lead, *y.shape[-2:]).flatten(0, -4) for y in (q, k, v))  # (P, heads, Q or M, head_dim)
         if mask is not None:
             mask = mask[..., None, None, :].expand(*lead[:-1], 1, 1, -1).flatten(0, -4)  # (P, 1, 1, M)
+        if self.table is not None:
+            frames = torch.arange(q.shape[-2], device=q.device)
+            apart = frames[:, None] - frames + self.table.shape[1] // 2  # (S, S)
+            mask = self.table[:, apart].to(q.dtype)  # (heads, S, S)
         out = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)  # (P, heads, Q, head_dim)
         return self.to_out(out.transpose(1, 2).flatten(2).unflatten(0, lead[:-1]))  # (..., Q, D)
 

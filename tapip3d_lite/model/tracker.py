@@ -28,6 +28,7 @@ from tapip3d_lite.model.neighbors import Neighbors
 from tapip3d_lite.model.registry import make_module, make_space
 from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.stream import Stream
+from tapip3d_lite.model.trial import match_start
 from tapip3d_lite.model.updater import token_width, trajectory_tokens
 from tapip3d_lite.model.windows import Scene, State, Step, Window, query_support, to_world, window_ends
 
@@ -48,6 +49,7 @@ class Tracker(nn.Module):
     """
 
     sync_free: bool = False
+    trial: dict[str, Any] = {}  # noqa: RUF012
 
     def __init__(self, config: TrackerConfig, fast: bool = True) -> None:
         super().__init__()
@@ -145,16 +147,30 @@ class Tracker(nn.Module):
         columns, mask = state.members(stop, active, self.sync_free)  # (n,), (B, n)
         if not len(columns):
             return
-        coords, logits = state.initial(start, stop, columns)  # (B, S, n, 3), (B, S, n)
+        coords, logits = state.initial(start, stop, columns, self.trial.get("velocity", 0.0))  # (B, S, n, 3), (B, S, n)
+        if "match" in self.trial:
+            coords = self._matched(scene, support, state, columns, coords)
         window = self.window(scene, [near.pick(columns) for near in support], mask, columns)
         window = window if on_window is None else on_window(window)
         coords = window.norm.normalize(coords)
         for iteration in range(iterations):
             # Nothing flows back from one iteration into the one before.
             coords, logits = self.update(window, coords, logits)
-            yield Step(start, iteration, window.norm.restore(coords), logits, columns, mask, scene)
-            coords, logits = coords.detach(), logits.detach()
+            yield Step(start, iteration, window.norm.restore(coords), logits, columns, mask, scene, self._spread)
+            if not (self.trial.get("grad2") and (iterations - 1 - iteration) % 2):
+                coords, logits = coords.detach(), logits.detach()
         state.write(start, stop, columns, mask, window.norm.restore(coords), logits)
+
+    def _matched(
+        self, scene: Scene, support: list[Neighbors], state: State, columns: Tensor, coords: Tensor
+    ) -> Tensor:
+        frame = torch.arange(len(scene.frames), device=coords.device)[None, :, None]  # (1, S, 1)
+        times = (state.times[:, columns] - scene.start)[:, None]  # (B, 1, n)
+        half = len(scene.frames) // 2
+        known = (times < half) & (scene.start > 0)  # which the window before has solved
+        free = (frame != times) & (~known | (frame >= half))
+        own = support[0].features[:, columns, 0]
+        return match_start(scene, own, coords, free, self.trial["match"])
 
     def scene(
         self, frames: Frames, features: Tensor, space: Any, depth_roi: tuple[float, float] | None, start: int = 0
@@ -206,15 +222,20 @@ class Tracker(nn.Module):
 
     def update(self, window: Window, coords: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
         """Update one window's trajectories once (equation 3): normalised coords (B, S, n, 3) and logits (B, S, n)."""
-        frames = window.scene.frames
+        frames, kind = window.scene.frames, self.trial.get("grad2")
+        from_coords, from_logits = coords, logits
+        if kind == "residual":
+            coords, logits = coords.detach(), logits.detach()
         with torch.autocast(coords.device.type, enabled=False):
             uv = window.scene.space.to_pixels(window.norm.restore(coords), frames.intrinsics, frames.extrinsics)
+        uv = uv.detach() if kind == "smooth" else uv
         evidence = self.evidence(window, coords, uv)  # (B, S, n, L * width)
         pixels = uv if self.config.use_uv else None
         tokens = trajectory_tokens(coords, logits, evidence, pixels, frames.size, self.time)  # (B, S, n, token width)
         delta = self.updater(tokens, window.active).to(coords.dtype)  # (B, S, n, 4 or 5): dx, dy, dz, dv
         free = constant(tuple(getattr(window.scene.space, "free_axes", (1.0, 1.0, 1.0))), delta)
-        return coords + delta[..., :3] * free, logits + delta[..., 3]
+        self._spread = delta[..., 5:] if "spread" in self.trial else None
+        return from_coords + delta[..., :3] * free, from_logits + delta[..., 3]
 
     def evidence(self, window: Window, coords: Tensor, uv: Tensor) -> Tensor:
         """Collect each estimate's neighbourhood and compare it with the query's, at all levels: (B, S, n, L * width).

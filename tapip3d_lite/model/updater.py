@@ -67,6 +67,9 @@ class Transformer(nn.Module):
         self.scatter = nn.ModuleList(Block(*sizes, cross=True) for _ in range(config.space_depth))
         self.head = nn.Linear(config.hidden, config.outputs - 2 if config.separate_vis_head else config.outputs)
         self.vis_head = nn.Linear(config.hidden, 2) if config.separate_vis_head else None
+        self.register_parameter("keep", None)  # trials
+        self.register_parameter("again", None)
+        self.spread = None
         # An untrained tracker should leave points nearly where they are.
         for head in filter(None, (self.head, self.vis_head)):
             nn.init.normal_(head.weight, std=1e-3)
@@ -81,14 +84,21 @@ class Transformer(nn.Module):
         points = self.input(tokens)  # (B, S, N, inputs) -> (B, S, N, U)
         batch, frames, count = points.shape[:3]
         x = torch.cat([points, self.virtual.to(points.dtype).expand(batch, frames, -1, -1)], 2)  # (B, S, N + V, U)
+        first = x
         mask = None if active is None else (active | ~active.any(-1, keepdim=True))[:, None]  # (B, 1, N)
         for i, block in enumerate(self.time):
+            x = self._again(x, first, i)
             x = block(x.transpose(1, 2)).transpose(1, 2)  # attention over S, for each track
             if i % self.every == 0:
+                x = self._again(x, first, len(self.time) + i // self.every)
                 points, virtual = x[:, :, :count], x[:, :, count:]
                 j = i // self.every
                 virtual = self.mix[j](self.gather[j](virtual, points, mask))  # (B, S, V, U)
                 x = torch.cat([self.scatter[j](points, virtual), virtual], 2)
         points = x[:, :, :count]  # (B, S, N, U)
         out = self.head(points)
-        return out if self.vis_head is None else torch.cat([out, self.vis_head(points)], -1)
+        out = out if self.vis_head is None else torch.cat([out, self.vis_head(points)], -1)
+        return out if self.spread is None else torch.cat([out, self.spread(points)], -1)
+
+    def _again(self, x: Tensor, first: Tensor, part: int) -> Tensor:
+        return x if self.keep is None else self.keep[part] * x + self.again[part] * first

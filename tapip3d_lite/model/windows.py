@@ -72,6 +72,7 @@ class Step:
     columns: Tensor
     active: Tensor
     scene: Scene
+    spread: Tensor | None = None  # trial: (B, S, n, 1 or 2)
 
     @property
     def xyz(self) -> Tensor:
@@ -159,7 +160,7 @@ class State:
         columns = inside.any(0).nonzero()[:, 0]
         return columns, inside[:, columns]
 
-    def initial(self, start: int, stop: int, columns: Tensor) -> tuple[Tensor, Tensor]:
+    def initial(self, start: int, stop: int, columns: Tensor, velocity: float = 0.0) -> tuple[Tensor, Tensor]:
         """What a window starts from: its first half as it is, then that half's last frame repeated.
 
         Tracks queried in the second half have no history yet and start at their query in all frames.
@@ -168,6 +169,10 @@ class State:
         source = torch.arange(start, stop, device=columns.device).clamp(max=start + half - 1)  # (S,)
         coords, logits = self.coords[:, source][:, :, columns], self.logits[:, source][:, :, columns]
         known = (self.times[:, columns] < start + half)[:, None]  # (B, 1, n)
+        if velocity and start:
+            from tapip3d_lite.model.trial import extrapolate
+
+            coords = extrapolate(coords, self.times[:, columns] - start, half, velocity)
         coords = torch.where(known[..., None], coords, self.queries[:, None, columns])
         return coords, torch.where(known, logits, 0)
 

@@ -42,9 +42,13 @@ def add_gradients(
     whole, window = Leaves(), Leaves()
     leaf = whole.of(features)
     iterations, totals = options.get("iterations") or tracker.config.iterations, []
+    pending = 0.0
     for step in tracker.steps(frames, queries, features=leaf, on_window=window.shared, **options):
         parts = step_loss(step, truth, iterations, config)
-        sum(parts).backward()
+        pending = pending + sum(parts)
+        if not (tracker.trial.get("grad2") and (iterations - 1 - step.iteration) % 2):
+            pending.backward()
+            pending = 0.0
         if step.iteration == iterations - 1:
             window.backward(retain_graph=True)  # the queries' neighbourhoods also serve the next window
         totals.append(torch.stack(parts).detach())

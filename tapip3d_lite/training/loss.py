@@ -58,6 +58,7 @@ class LossConfig:
     visibility: float = 3.0
     discount: float = 0.8
     scale: float = 0.005
+    spread: float = 4.0
     soften: float = 0.0
     within: float = 0.0
 
@@ -81,6 +82,8 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
     if config.within:
         visible = visible & (pixels < config.within)
     error = config.soften * torch.log1p(pixels / config.soften) if config.soften else pixels
+    if step.spread is not None:
+        error = config.spread * spread_loss(pixels, step.spread)
     if config.form == "paper":
         error = error / focal
     entropy = F.binary_cross_entropy_with_logits(step.logits, visible.to(step.logits.dtype), reduction="none")
@@ -89,6 +92,22 @@ def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> 
     total = counted.flatten(1).sum(1).clamp(min=1)
     position, visibility = (((x * counted).flatten(1).sum(1) / total).mean() for x in (error, entropy))
     return weight * position, weight * config.visibility * visibility
+
+
+def spread_loss(pixels: Tensor, spread: Tensor) -> Tensor:
+    """Negative log likelihood of errors in pixels (...) under a Laplace of predicted log scale (..., 1).
+
+    With (..., 2) it is a mixture of one whose scale is a pixel and one of predicted log scale; second is its logit.
+    """
+    spread = spread.float()
+    log_b = spread[..., 0]
+    if spread.shape[-1] == 1:
+        log_b = log_b.clamp(-3, 6)
+        return pixels * torch.exp(-log_b) + log_b
+    log_b = log_b.clamp(0, 6)
+    one = F.logsigmoid(spread[..., 1]) - pixels
+    other = F.logsigmoid(-spread[..., 1]) - pixels * torch.exp(-log_b) - log_b
+    return -torch.logaddexp(one, other)
 
 
 @torch.no_grad()

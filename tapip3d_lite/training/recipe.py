@@ -79,6 +79,7 @@ class TrainConfig:
     save_every: int = 250
     augment: bool = False
     sensor: float = 0.4
+    trial: dict[str, Any] = field(default_factory=dict)
     loss: LossConfig = field(default_factory=lambda: LossConfig(visibility=0.5))
     motion: MotionConfig = field(default_factory=MotionConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from tapip3d_lite.files import shipped_weights
+from tapip3d_lite.model import trial as trials
 from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.registry import fast_step
 from tapip3d_lite.model.tracker import Tracker
@@ -30,7 +31,8 @@ from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.pretrain import FramePair, matching_loss
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.run_folder import Bar, RunFolder
-from tapip3d_lite.training.schedule import Schedule, adamw
+from tapip3d_lite.training.schedule import Schedule
+from tapip3d_lite.training.trial import make_optimizer
 
 
 class Trainer:
@@ -84,13 +86,16 @@ class Trainer:
             torch.manual_seed(config.seed)
             self.tracker = Tracker(config.tracker_config()).to(device).train()
             nn.init.normal_(self.tracker.updater.head.weight, std=config.head)
+            trials.apply(self.tracker, config.trial)
+        if config.trial.get("encoder"):
+            self.tracker.encoder.load_state_dict(torch.load(config.trial["encoder"], weights_only=True))
         if config.init is not None:
             _start_from(self.tracker, config.init)
         self.group, self.step, self.seconds = Group(device), 0, 0.0
         self._on_gpu, cache = torch.device(device).type == "cuda", None
         if not config.train_encoder and not self._on_gpu:
             size = self.tracker.config.image_size
-            cache = FeatureCache(self.folder.path / "features", self.tracker.encoder, size)
+            cache = FeatureCache(config.trial.get("features") or self.folder.path / "features", self.tracker.encoder, size)
             cache.check_room(clips)
         self.examples = Examples(config, clips, self.group.rank, cache)
         saved = self.folder.checkpoint(device)
@@ -158,7 +163,11 @@ class Trainer:
             raise FloatingPointError(self.folder.save_failure(line, norm, self._drawn))
         lr, beta1 = self.schedule.rate()
         for group in self.optimizer.param_groups:
-            group |= {"lr": lr, "betas": (beta1, group["betas"][1])}
+            group["lr"] = lr * group.get("scale", 1.0)
+            if "betas" in group:
+                group["betas"] = beta1, group["betas"][1]
+            if "decay" in group:
+                group["left"] = 1 - (before - self.config.matching_steps) / self.config.steps
         self.optimizer.step()
         self.step += 1
         self._add_to_average()
@@ -219,7 +228,9 @@ class Trainer:
         self.parameters = [p for p in self.tracker.parameters() if p.requires_grad]
         fast = fast_step(self.device)
         self._replay = None if fast is None else fast(self._add_gradients, self.tracker, self.parameters)
-        self.optimizer = adamw(self.parameters, recipe.lr, recipe.weight_decay, fused=self._on_gpu)
+        trial = {} if matching else self.config.trial
+        options = recipe.lr, recipe.weight_decay, self._on_gpu, trial
+        self.optimizer = make_optimizer(self.tracker, self.parameters, *options)
         if saved is not None:
             self.optimizer.load_state_dict(saved["optimizer"])
 
