@@ -26,7 +26,7 @@ from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.windows import Scene
 
 GRADIENT_DEGREE = 3
-_ENOUGH, _JUMP, _NEAR, _DEPTH = 0.5, 1.5, 2.5, 0.05
+_ENOUGH, _RATIO, _JUMP, _NEAR, _DEPTH = 0.3, 3.0, 1.5, 2.5, 0.05
 
 
 def apply(tracker: nn.Module, trial: dict[str, Any]) -> None:
@@ -96,10 +96,11 @@ def match_start(scene: Scene, own: Tensor, coords: Tensor, free: Tensor, radius:
     here = places[peak]  # (B, S, n, 2)
     near = (places - here[..., None, :]).square().sum(-1) <= _NEAR**2
     mass = (share * near).sum(-1)
+    rest = (share * ((places - cells[..., None, :]).square().sum(-1) <= _NEAR**2)).sum(-1)  # of standing still
     own_depth = depth.gather(2, peak)[..., None]
     weight = share * (near & ((depth[:, :, None] - own_depth).abs() < _DEPTH * own_depth))
     found = weight @ points / weight.sum(-1, keepdim=True).clamp(min=1e-9)  # (B, S, n, 3)
-    clear = free & some & (mass > _ENOUGH) & ((here - cells).norm(dim=-1) > _JUMP)
+    clear = free & some & (mass > _ENOUGH) & (mass > _RATIO * rest) & ((here - cells).norm(dim=-1) > _JUMP)
     return torch.where(clear[..., None], found, coords)
 
 
