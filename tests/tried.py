@@ -49,7 +49,7 @@ def page() -> str:
         f"Each change alone, in a small tracker (0.9 M parameters, 64×64 pixels) that trains for {steps:.0f} steps on 240 clips "
         "with one frozen encoder; scored on 32 other clips of 16 frames, three windows. Steps are timed in processor "
         "milliseconds. `python -m tests.tried` makes this page from `tests/data/tried.json`, and says how to train it all "
-        "again. What did not help is not in the library."
+        "again. What is not shown to help is not in the library."
     )
     return "\n\n".join([
         "# What was tried to make the tracker learn better", text, markdown_table(["row", "what"], list(map(list, ROWS.items()))),
