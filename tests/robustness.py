@@ -2,8 +2,8 @@
 
 A picture that slides at a constant speed; wrong poses, poor depth, soft and grey images and frozen depth on clips of
 `moving-camera`, each against the same clips as they are, paired; poor sensors and wrong poses after `steady_clip`; the
-share of hidden frames called visible; what other image sizes, fewer updates and bfloat16 cost and save. Results go to a JSON file, which an interrupted run continues, a
-Markdown page (for `card --also`) and a figure.
+share of hidden frames called visible; what other image sizes, fewer updates and bfloat16 cost and save. Results go to a
+JSON file, which an interrupted run continues, a Markdown page (for `card --also`) and a figure.
 """
 
 from __future__ import annotations

@@ -5,17 +5,24 @@ its history; these train and score all rows again:
 
     git worktree add ../trials bae8f53 && cd ../trials
     python trials/run.py --prepare          # 240 clips of 64 x 64 pixels, an encoder trained by matching, its features
-    python trials/run.py --steps 1000 --jobs 2
+    python trials/run.py --rows standard muon grad2 velocity match timebias scalars zeroinit laplace decay0 bf16 --jobs 2
+
+and `python -m tests.tried --runs ../trials/trials/runs` here takes their scores over into `tests/data/tried.json`.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from tapip3d_lite.evaluation.evaluate import markdown_table
+from tapip3d_lite.files import write_text
 from tapip3d_lite.lab.table import Table, compare
 
+METRICS = ("APD3D_none_dynamic", "AJ3D_none", "OA")
 DATA = Path(__file__).parent / "data" / "tried.json"
 ROWS = {
     "standard": "AdamW, gradients through one update at a time, the average of the last weights",
@@ -33,6 +40,33 @@ ROWS = {
     "static": "zero motion",
     "klt": "Lucas-Kanade",
 }
+
+
+def gathered(runs: Path) -> dict[str, dict[int, dict[str, Any]]]:
+    """What `compare` takes, from a folder with `<row>-<seed>/scores.json` and `baselines.json`, in the order of `ROWS`."""
+    found: dict[str, dict[int, dict[str, Any]]] = {row: {} for row in ROWS}
+    for row in ROWS:
+        for path in sorted(runs.glob(f"{row}-[0-9]/scores.json")):
+            one = json.loads(path.read_text())
+            costs = {name: one[name] for name in ("parameters", "steps")} | {
+                "step_ms": round(1000 * one["cpu_step"], 2)
+            }
+            entry = {"training": path.parent.name, "costs": costs}
+            found[row][one["seed"]] = entry | {"scores": by_clip(one["names"], one["average"])}
+            if row == "standard":
+                found["last weights"][one["seed"]] = entry | {"scores": by_clip(one["names"], one["last"])}
+    for row, scores in json.loads((runs / "baselines.json").read_text()).items():
+        found[row][0] = {"training": None, "costs": {}, "scores": by_clip(one["names"], scores)}
+    return found
+
+
+def by_clip(names: Sequence[str], scores: Mapping[str, Sequence[float]]) -> dict[str, dict[str, float | None]]:
+    """Scores by clip and metric, None where one is undefined, of lists by metric."""
+    rows = [[round(scores[metric][i], 5) for metric in METRICS] for i in range(len(names))]
+    return {
+        n: {m: None if x != x else x for m, x in zip(METRICS, row, strict=True)}
+        for n, row in zip(names, rows, strict=True)
+    }
 
 
 def table(metric: str = "APD3D_none_dynamic") -> Table:
@@ -57,5 +91,14 @@ def page() -> str:
     ])  # fmt: skip
 
 
-if __name__ == "__main__":
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=Path, help="take the scores over from the trials' folder first")
+    options = parser.parse_args()
+    if options.runs:
+        write_text(DATA, json.dumps(gathered(options.runs), separators=(",", ":")) + "\n")
     print(page())
+
+
+if __name__ == "__main__":
+    main()

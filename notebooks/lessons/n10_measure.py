@@ -38,14 +38,13 @@ def fingerprint(clip: Clip, carry: Callable | None = None) -> dict[str, float]:
     the camera moves from frame to frame.
     """
     known = clip.depths[clip.depths > 0]
-    places = invert(clip.extrinsics.astype(np.float64))[:, :3, 3]
     return {
         "near": misfit(clip, 1, carry),
         "far": misfit(clip, len(clip) // 2, carry),
         "colour": agreement(reduced(clip)).colour,
         "bend": 1000 * curvature(clip)[0],
         "depth": float(np.median(known)),
-        "travel": float(np.linalg.norm(np.diff(places, axis=0), axis=-1).mean()),
+        "travel": float(np.linalg.norm(np.diff(places(clip), axis=0), axis=-1).mean()),
     }
 
 

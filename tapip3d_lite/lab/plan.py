@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -97,6 +98,7 @@ class Plan:
         self.save()
         return data
 
+    @cached_property
     def judged(self) -> tuple[Path, ...]:
         """The clips that rows are judged by, as from `find_clips`."""
         held_out = judged_by(self._clips, self.budget)

@@ -173,7 +173,7 @@ class Study:
         found = self.results().get(row, {}).get(seed, {})
         if clip not in found.get("scores", {}):
             raise ValueError(f"Study: row {row!r} has no scores of {clip!r} with seed {seed}; run the study first")
-        index, path = next((i, path) for i, path in enumerate(self.plan.judged()) if path.stem == clip)
+        index, path = next((i, path) for i, path in enumerate(self.plan.judged) if path.stem == clip)
         variant, training = self.plan.rows[row], found["training"] and self.plan.store / "trainings" / found["training"]
         seen = under(judged_clip(path, self.plan.budget), variant.degrade, index)
         custom = [] if training is None else self.plan.recipe(variant).custom

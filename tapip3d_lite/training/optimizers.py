@@ -25,7 +25,7 @@ def make_optimizer(
 ) -> Any:
     """An optimiser like torch's, one of `OPTIMIZERS`, for some of a tracker's parameters; `fused`: AdamW in one kernel (GPU).
 
-    Biases and the parameters of norms, which are vectors, do not decay.
+    Biases and the parameters of norms, which are vectors, do not decay (paper: appendix, training; decay 5e-4).
     """
     chosen = {id(weight) for weight in hidden_matrices(tracker)} if kind == "muon" else set()
     matrices, rest = ([p for p in parameters if (id(p) in chosen) is inside] for inside in (True, False))

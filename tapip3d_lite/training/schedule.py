@@ -1,7 +1,6 @@
 """`Schedule`: how far a training has come, by its number of steps or by the clock, and what follows from that.
 
-Paper: appendix (training): one cosine cycle up to 5e-4, with 5 % of the steps for the warm-up; weight decay 5e-4 except
-for biases and norms.
+Paper: appendix (training): one cosine cycle up to 5e-4, with 5 % of the steps for the warm-up.
 """
 
 from __future__ import annotations
