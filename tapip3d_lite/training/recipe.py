@@ -52,6 +52,7 @@ class TrainConfig:
         average: the weights that are scored and saved are an exponential average over so many steps, or over a tenth of
             the steps done where that is less; 0: the last weights.
         head: standard deviation of the output layer's initial weights.
+        zero_blocks: the updater's blocks start as identities, with output projections of zero.
         seed: of the random generators.
         evaluate_every: steps between evaluations on held-out clips.
         validation: number of held-out clips.
@@ -86,6 +87,7 @@ class TrainConfig:
     precision: str = "float32"
     average: int = 1000
     head: float = 0.01
+    zero_blocks: bool = False
     seed: int = 0
     evaluate_every: int = 1000
     validation: int = 8

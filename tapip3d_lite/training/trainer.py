@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.registry import fast_step
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
@@ -92,6 +93,9 @@ class Trainer:
             self.tracker = Tracker(config.tracker_config()).to(device).train()
             if isinstance(head := getattr(self.tracker.updater, "head", None), nn.Linear):
                 nn.init.normal_(head.weight, std=config.head)
+            for block in self.tracker.updater.modules() if config.zero_blocks else ():
+                if isinstance(block, Block):
+                    block.start_as_identity()
         if config.init is not None:
             self.tracker.load_state_dict(initial_weights(config))
         self.folder = RunFolder(folder, config, resume)
