@@ -346,9 +346,11 @@ def test_other_clips_are_refused(study, store, tmp_path):
         ({"rows": None}, "holds no study"),
         ({"seeds": 0}, "Study.seeds"),
         ({"budget": "labs"}, "did you mean lab"),
-        ({"steps": 5, "minutes": 2}, "at most one of steps and minutes"),
+        ({"steps": 5, "minutes": 2}, "at most one of steps, minutes and flops"),
         ({"steps": -1}, "TrainConfig.steps"),
         ({"minutes": 0}, "TrainConfig.minutes"),
+        ({"flops": -1}, "Budget.flops"),
+        ({"flops": 10}, r"row 'n2n': a step takes .* operations, more than the budget of 10 has"),
     ],
 )
 def test_bad_plans_are_refused(tmp_path, arguments, message):
@@ -367,6 +369,27 @@ def test_equal_time_in_place_of_equal_steps(store, tmp_path):
     made = lab.Study(tmp_path / "minutes", TWO, seeds=1, budget="tiny", minutes=0.02, store=store)
     assert made.run(progress=False) and lab.Study(tmp_path / "minutes", store=store).plan.budget.recipe.minutes == 0.02
     assert all(row["steps"] >= 2 for row in made.table().rows)
+
+
+def test_a_time_that_no_step_fits_marks_the_row(store, tmp_path):
+    made = lab.Study(tmp_path / "minutes", TWO[:1], seeds=1, budget="tiny", minutes=1e-6, store=store)
+    assert made.run(progress=False)
+    assert "1e-06 minutes fit no step: one takes" in made.results()["n2n"][0]["failed"]
+
+
+def test_equal_operations_in_place_of_equal_steps(store, tmp_path):
+    """A row that costs more a step takes fewer steps; a step's operations are those that its matrices have."""
+    costs = [jobs.step_flops(row.recipe(TINY.recipe)) for row in TWO]
+    made = lab.Study(tmp_path / "flops", TWO, seeds=1, budget="tiny", flops=7.5 * max(costs), store=store)
+    assert made.run(progress=False) and lab.Study(tmp_path / "flops", store=store).plan.budget.flops == 7.5 * max(costs)
+    wanted = [int(7.5 * max(costs) / cost) for cost in costs]
+    assert [row["steps"] for row in made.table().rows] == wanted and sorted(wanted)[0] == 7 < sorted(wanted)[1]
+    twice = replace(TINY.recipe, batch=2)
+    assert jobs.step_flops(twice) == pytest.approx(2 * jobs.step_flops(TINY.recipe))
+    longer = replace(TINY.recipe, iterations=4)
+    assert jobs.step_flops(longer) == pytest.approx(2 * jobs.step_flops(TINY.recipe), rel=0.1)
+    along = replace(TINY.recipe, train_encoder=True)
+    assert jobs.step_flops(along) > 1.02 * jobs.step_flops(TINY.recipe)
 
 
 # --- results ------------------------------------------------------------------------------------------------------------

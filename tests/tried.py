@@ -7,6 +7,8 @@ its history; these train and score all rows again:
     python trials/run.py --prepare          # 240 clips of 64 x 64 pixels, an encoder trained by matching, its features
     python trials/run.py --rows standard muon grad2 velocity match timebias scalars zeroinit laplace decay0 bf16 --jobs 2
 
+(the row `muon-zeroinit` was added to `ROWS` there: `{"trial": {"muon": 1.0, "zeroinit": "updater"}}`)
+
 and `python -m tests.tried --runs ../trials/trials/runs` here takes their scores over into `tests/data/tried.json`.
 """
 
@@ -28,12 +30,13 @@ ROWS = {
     "standard": "AdamW, gradients through one update at a time, the average of the last weights",
     "last weights": "the same trainings, without the average (`--average 0`)",
     "muon": "Muon for the matrices inside blocks (`--optimizer muon`)",
+    "zeroinit": "the updater's output projections start at zero (`--zero-blocks`)",
+    "muon-zeroinit": "both",
     "grad2": "gradients through two updates; not through Fourier features finer than degree 3, nor through pixels",
     "velocity": "a window's new frames start with constant velocity in place of the last position",
     "match": "first estimates start at the most similar cell (soft-argmax within 8 cells), where that is clear",
     "timebias": "a learnt bias for each distance in time in place of the absolute embedding",
     "scalars": "learnt factors of the residual and of the input before each part of the updater",
-    "zeroinit": "the updater's output projections start at zero",
     "laplace": "a predicted spread: the likelihood of a Laplace distribution in place of the error",
     "decay0": "cautious weight decay (only where it agrees with the step) that falls to zero",
     "bf16": "bfloat16 by autocast",

@@ -48,6 +48,8 @@ class Budget:
         scene: the settings of a seed's clip; a function at the top level of a module, since processes import it.
         held_out: number of clips that rows are judged by; their seeds are those that no training draws.
         frames, points: at most so many of a held-out clip; all its points are asked for in frame 0, which shows them.
+        flops: floating-point operations of each row's training, see `step_flops`; a row then takes as many steps as fit
+            into them. None: the recipe's steps.
     """
 
     recipe: TrainConfig
@@ -55,16 +57,19 @@ class Budget:
     held_out: int = 30
     frames: int = 8
     points: int = 64
+    flops: float | None = None
 
     def __post_init__(self) -> None:
         if not 2 <= self.held_out <= len(STUDIES):
             raise ValueError(f"Budget.held_out: expected 2 to {len(STUDIES)} clips, got {self.held_out}")
         if self.frames < 2 or self.points < 1:
             raise ValueError(f"Budget: expected at least 2 frames and 1 point, got {self.frames}, {self.points}")
+        if self.flops is not None and not 0 < self.flops < float("inf"):
+            raise ValueError(f"Budget.flops: expected a positive number of operations or None, got {self.flops}")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as they come back from JSON."""
-        rest = {name: getattr(self, name) for name in ("held_out", "frames", "points")}
+        rest = {name: getattr(self, name) for name in ("held_out", "frames", "points", "flops")}
         return {"recipe": self.recipe.to_dict(), "scene": plain(self.scene), **rest}
 
     @classmethod
@@ -88,7 +93,7 @@ _FOCUSED = {  # all of the steps go into the world frame and into perfect depth
     "motion": MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0), "sensor": 0.0, "lr": 1.5e-3, "iterations": 2,
 }  # fmt: skip
 _LAB_STEPS = {
-    "clips": 240, "matching_steps": 600, "steps": 1500, "average": 150, "evaluate_every": 250, "validation": 8,
+    "clips": 240, "matching_steps": 1500, "steps": 1500, "average": 150, "evaluate_every": 250, "validation": 8,
     "frames": 8, "sampling": SamplingConfig(tracks=48),
 }  # fmt: skip
 _TINY_STEPS = {

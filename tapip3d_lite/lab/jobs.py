@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -96,6 +97,8 @@ def _trained(job: Job, tell: Tell, stop: Stop) -> bool:
 
         if trainer.schedule.matching or not first:
             trainer.run(halt, progress=False)
+            if job.recipe.minutes and trainer.step == 1:
+                raise ValueError(f"{job.recipe.minutes:g} minutes fit no step: one takes {trainer.seconds:.2g} seconds")
         if first and not trainer.schedule.matching:
             save_weights(trainer.average, weights)
     if weights.exists():
@@ -139,6 +142,30 @@ def track_costs(tracker: TrackerLike, clip: Clip, options: dict[str, Any]) -> di
         tracker.track(clip, **options)
     count = counter.get_total_flops() / 2 / len(clip) / len(clip.queries)
     return {"parameters": sum(p.numel() for p in tracker.parameters()), "multiply_adds": round(count)}
+
+
+def step_flops(recipe: TrainConfig) -> float:
+    """Floating-point operations of a training step, about: three times those of its forward pass.
+
+    A stored encoder costs none. The mean over the recipe's lengths of examples and numbers of updates.
+    """
+
+    def forward(frames: int, iterations: int) -> float:
+        camera = np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1]], np.float32)
+        cameras = np.repeat(camera[None], frames, 0), np.repeat(np.eye(4, dtype=np.float32)[None], frames, 0)
+        queries = np.tile(np.float32([0, 0, 0, 1]), (recipe.sampling.tracks, 1))
+        flat = np.ones((frames, height, width), np.float32)
+        clip = Clip(np.zeros((*flat.shape, 3), np.uint8), flat, *cameras, queries)
+        with FlopCounterMode(display=False) as counter:
+            tracker.track(clip, support_grid=0, iterations=iterations)
+        of = {part: sum(counts.values()) for part, counts in counter.get_flop_counts().items()}
+        return of["Global"] - (0 if recipe.train_encoder else of[type(tracker.encoder).__name__])
+
+    tracker = Tracker(recipe.tracker_config()).eval()
+    height, width = tracker.config.image_size
+    (few, many), (least, most) = recipe.frames, recipe.iterations
+    start, rest = forward(few, least), [forward(s, m) for s in {few, many} for m in {least, most}]
+    return 3 * recipe.batch * (recipe.short * start + (1 - recipe.short) * statistics.mean(rest))
 
 
 def step_costs(folder: Path) -> dict[str, float]:

@@ -138,7 +138,7 @@ TABLES: dict[str, dict[str, Any]] = {
 and other arguments of `Study`. The paper's numbers are AJ3D, APD3D and OA; a row whose numbers are not at hand has none."""
 
 PAPER = Path(__file__).parent / "paper"  # the tables' results, and weights of one seed, as they are shipped
-_FIELDS = ("folder", "rows", "against", "seeds", "budget", "steps", "minutes", "store")
+_FIELDS = ("folder", "rows", "against", "seeds", "budget", "steps", "minutes", "flops", "store")
 
 
 def open_study(
@@ -176,7 +176,7 @@ def open_study(
     rows = values.get("rows", {})
     if not isinstance(rows, Mapping) or not all(isinstance(row, Mapping) for row in rows.values()):
         raise ValueError(f"{source}: expected rows by name, e.g. [rows.p2n] with context = 'p2n' below, got {rows!r}")
-    kept = {k: v for k, v in values.items() if k in ("seeds", "budget", "steps", "minutes")}
+    kept = {k: v for k, v in values.items() if k in ("seeds", "budget", "steps", "minutes", "flops")}
     if "store" in values:
         kept["store"] = home / values["store"]
     folder = home / values.get("folder", Path("runs") / path.stem)

@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from tapip3d_lite.files import digest, read_json, write_text
 from tapip3d_lite.lab.budgets import Budget, Data, judged_by, simulated
-from tapip3d_lite.lab.jobs import Job
+from tapip3d_lite.lab.jobs import Job, step_flops
 from tapip3d_lite.lab.provenance import diff, own_code, source_code
 from tapip3d_lite.lab.variant import Variant
 from tapip3d_lite.training.recipe import TrainConfig
@@ -50,6 +50,7 @@ class Plan:
     code: dict[str, str] = field(default_factory=source_code)
     clips: dict[str, str] | None = None
     settled: bool = False
+    _steps: dict[str, int] = field(default_factory=dict, init=False)  # that fit into the budget's operations
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as `study.json` holds them."""
@@ -66,7 +67,7 @@ class Plan:
         """Raise ValueError for a row that cannot be built."""
         for row in self.rows.values():
             if row.given is None:
-                row.recipe(self.budget.recipe)
+                self.recipe(row)
 
     def take_over(self, old: Mapping[str, Any], accept_code: bool) -> None:
         """Refuse (ValueError) an old plan that differs in what must be equal; take over what it knows."""
@@ -121,8 +122,18 @@ class Plan:
         return found
 
     def recipe(self, row: Variant, seed: int = 0) -> TrainConfig:
-        """What is trained for a row and seed, given an encoder."""
-        return replace(row.recipe(self.budget.recipe), seed=seed, matching_steps=0)
+        """What is trained for a row and seed, given an encoder; ValueError where the budget's operations fit no step."""
+        recipe = replace(row.recipe(self.budget.recipe), seed=seed, matching_steps=0)
+        if self.budget.flops is None:
+            return recipe
+        if row.name not in self._steps:
+            self._steps[row.name] = int(self.budget.flops / (cost := step_flops(recipe)))
+            if not self._steps[row.name]:
+                raise ValueError(
+                    f"row {row.name!r}: a step takes {cost:.3g} floating-point operations, more than the budget of "
+                    f"{self.budget.flops:.3g} has"
+                )
+        return replace(recipe, steps=self._steps[row.name])
 
     def encoders(self, data: Data, device: str) -> list[Job]:
         """The encoders that are still to be trained."""

@@ -51,6 +51,7 @@ class Study:
         budget: str | Budget | None = None,
         steps: int | None = None,
         minutes: float | None = None,
+        flops: float | None = None,
         store: str | Path | None = None,
         accept_code: bool = False,
         parts: Sequence[Any] = (),
@@ -63,7 +64,8 @@ class Study:
             seeds: number of trainings of each row; by default 3.
             budget: a name of `BUDGETS`, by default `"lab"`, or one's own.
             steps: of every row, in place of the budget's.
-            minutes: that the training of every row takes, on one core, in however many steps.
+            minutes, flops: time on one core, or floating-point operations, that the training of every row takes, in
+                however many steps.
             store: what studies can share; by default `folder / "store"`.
             accept_code: go on with results of other code; each result says with which code it was made.
             parts: custom parts, or modules, that rows and budget of the folder may name, as for `load_tracker`; what the
@@ -82,14 +84,18 @@ class Study:
         names = [row.name for row in rows]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"Study: two rows are called {', '.join(twice)}; rename one")
-        changes = {k: v for k, v in (("steps", steps), ("minutes", minutes)) if v is not None}
+        changes = {"steps": steps, "minutes": minutes, "flops": flops}
+        changes = {name: value for name, value in changes.items() if value is not None}
         if not rows or len(changes) > 1:
-            raise ValueError(f"Study: expected rows, at most one of steps and minutes; got {len(rows)} rows, {changes}")
+            raise ValueError(
+                f"Study: expected rows, at most one of steps, minutes and flops; got {len(rows)} rows, {changes}"
+            )
         seeds = seeds if seeds is not None else old["seeds"] if old else 3
         if not isinstance(seeds, int) or seeds < 1:
             raise ValueError(f"Study.seeds: expected a number of trainings of at least 1, got {seeds!r}")
         budget = _chosen(budget, old, parts)
-        budget = replace(budget, recipe=replace(budget.recipe, **changes))
+        flops = changes.pop("flops", budget.flops)
+        budget = replace(budget, flops=flops, recipe=replace(budget.recipe, **changes))
         store = Path(store) if store else folder / "store"
         self.plan = Plan(folder, store, dict(zip(names, rows, strict=True)), seeds, budget)
         self.plan.check_rows()
