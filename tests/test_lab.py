@@ -28,7 +28,7 @@ from tapip3d_lite.training.examples import Examples
 from tapip3d_lite.training.loss import LossConfig
 from tapip3d_lite.training.trainer import Trainer
 from tests import pack_tables
-from tests.lab_conditions import Mean, darker
+from tests.lab_conditions import Mean, Mine, darker
 from tests.tiny import ROOT
 
 TINY = lab.BUDGETS["tiny"]
@@ -198,6 +198,13 @@ def test_parts_of_a_users_own_are_rows(store, tmp_path):
     clip = next(iter(found["class"][0]))
     assert again.plan.rows["class"].recipe(TINY.recipe).tracker_config().context is Mean
     assert np.isfinite(again.tracks("class", clip)[1].xyz).all()
+
+
+def test_a_part_made_of_the_librarys_is_counted_and_scored(study, store, tmp_path):
+    made = lab.Study(tmp_path / "own", [lab.Variant("n2n", context=Mine)], seeds=1, budget="tiny", store=store)
+    assert made.run(progress=False) and made.results()["n2n"][0].get("failed") is None
+    costs = [x.results()["n2n"][0]["costs"]["parameters"] for x in (made, study)]
+    assert costs[0] == costs[1]
 
 
 def test_a_folder_alone_imports_no_code(tmp_path, monkeypatch):

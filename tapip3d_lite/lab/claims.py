@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from tapip3d_lite.evaluation.evaluate import markdown_table
-from tapip3d_lite.lab.statistics import verdicts
+from tapip3d_lite.lab.statistics import holm
 from tapip3d_lite.lab.table import TITLES, Results, Table, difference, shown
 
 METRICS = ("AJ3D", "APD3D", "OA")
@@ -60,8 +60,13 @@ def judge(results: Results, paper: Mapping[str, Any], metrics: Sequence[str]) ->
                 continue
             found.append({"row": one, "against": other, "metric": metric, "paper": theirs, "ours": asdict(ours)})
             effects.append(ours)
-    for claim, verdict in zip(found, verdicts(effects), strict=True):
-        gap = claim["paper"][0] - claim["paper"][1]
-        decided = "agree" if gap * claim["ours"]["mean"] > 0 else "disagree"
-        claim["verdict"] = "undecided" if verdict == "undecided" or gap == 0 else decided
+    for claim, p in zip(found, holm([one.p for one in effects]), strict=True):
+        claim["verdict"] = beside(claim["paper"][0] - claim["paper"][1], claim["ours"]["mean"], p)
     return found
+
+
+def beside(theirs: float, ours: float, p: float) -> str:
+    """What a study says of a claim, by the paper's difference, ours, and our p-value after Holm's correction."""
+    if theirs == 0 or not p <= 0.05:
+        return "undecided"
+    return "agree" if theirs * ours > 0 else "disagree"

@@ -138,6 +138,7 @@ def track_costs(tracker: TrackerLike, clip: Clip, options: dict[str, Any]) -> di
     """Parameters, and multiply-adds for each query and frame of a call of `track`, its encoder included."""
     if not isinstance(tracker, Tracker):
         return {}
+    tracker.requires_grad_(False)  # the counter would ask views of parameters, which have no history here, for theirs
     with FlopCounterMode(display=False) as counter:
         tracker.track(clip, **options)
     count = counter.get_total_flops() / 2 / len(clip) / len(clip.queries)
@@ -161,7 +162,7 @@ def step_flops(recipe: TrainConfig) -> float:
         of = {part: sum(counts.values()) for part, counts in counter.get_flop_counts().items()}
         return of["Global"] - (0 if recipe.train_encoder else of[type(tracker.encoder).__name__])
 
-    tracker = Tracker(recipe.tracker_config()).eval()
+    tracker = Tracker(recipe.tracker_config()).eval().requires_grad_(False)
     height, width = tracker.config.image_size
     (few, many), (least, most) = recipe.frames, recipe.iterations
     start, rest = forward(few, least), [forward(s, m) for s in {few, many} for m in {least, most}]
