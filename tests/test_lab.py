@@ -525,7 +525,7 @@ def test_shipped_tables_are_read_where_none_was_run(home, tmp_path, monkeypatch,
     for module in (papers, pack_tables):
         monkeypatch.setattr(module, "PAPER", shipped)
     monkeypatch.setitem(lab.BUDGETS, "tiny", replace(TINY, held_out=2, frames=4, points=8))
-    given = {"rows": {"klt": {"tracker": "klt"}, "n2n": {}}, "against": "klt", "seeds": 1, "budget": "tiny"}
+    given = {"rows": {"klt": {"tracker": "klt"}, "n2n": {}}, "against": "klt", "seeds": 2, "budget": "tiny"}
     for module in (papers, pack_tables):
         monkeypatch.setattr(
             module, "TABLES", {"n2n": given, "blur": {"rows": {"klt": {"tracker": "klt"}}, "against": "klt"}}
@@ -545,6 +545,8 @@ def test_shipped_tables_are_read_where_none_was_run(home, tmp_path, monkeypatch,
     made, _ = open_study("n2n", shipped=True)
     clip = next(iter(made.results()["n2n"][0]["scores"]))
     assert made.tracks("n2n", clip)[1].xyz.shape[0] == 4
+    with pytest.raises(ValueError, match="weights of row 'n2n', seed 1, are not in .* shipped table has those of seed 0"):
+        made.draw("n2n", "klt", seed=1)
     assert "wrote" in call(monkeypatch, capsys, "report", "paper", "--out", "all")
     assert "Without results yet: blur." in (here / "all/report.md").read_text()
     assert "minus klt" in (here / "all/n2n/report.md").read_text()

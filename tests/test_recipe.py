@@ -267,17 +267,6 @@ def test_a_training_with_a_time_budget_ends_with_it_and_continues(tmp_path, clip
         recipe(minutes=0)
 
 
-def test_blocks_start_as_identities_where_asked(tmp_path, clips):
-    plain, zero = (Trainer(tmp_path / str(x), recipe(zero_blocks=x, init=None), clips).tracker for x in (False, True))
-    tokens = torch.randn(1, 4, 3, plain.updater.input.in_features)
-    for tracker, same in ((plain, False), (zero, True)):
-        assert torch.equal(tracker.updater(tokens), tracker.updater.head(tracker.updater.input(tokens))) == same
-    changed = {name for name, x in zero.state_dict().items() if not torch.equal(x, plain.state_dict()[name])}
-    assert changed and all(
-        name.startswith("updater.") and (".to_out." in name or ".mlp.2." in name) for name in changed
-    )
-
-
 def test_muon_takes_the_matrices_inside_blocks_and_steps_as_far_as_adamw():
     """AdamW's first step moves each number by the learning rate; Muon's a number by 0.2 of it, as later ones of AdamW."""
     torch.manual_seed(0)

@@ -81,7 +81,7 @@ class Budget:
 
 _LAB = {
     "image_size": (64, 64), "stride": 2, "levels": 3, "neighbors": 9, "iterations": 2, "feature_dim": 32,
-    "token_dim": 32, "context_head_dim": 32, "offset_dim": 32, "hidden": 96, "heads": 4, "head_dim": 24,
+    "token_dim": 48, "context_head_dim": 48, "offset_dim": 32, "hidden": 96, "heads": 4, "head_dim": 24,
     "time_depth": 2, "space_depth": 2, "virtual_tracks": 8,
 }  # fmt: skip
 _TINY = {
@@ -90,6 +90,7 @@ _TINY = {
     "time_depth": 1, "space_depth": 1, "virtual_tracks": 4,
 }  # fmt: skip
 _FOCUSED = {  # all of the steps go into the world frame and into perfect depth
+    "optimizer": "muon", "start": "aligned",
     "motion": MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0), "sensor": 0.0, "lr": 1.5e-3, "iterations": 2,
 }  # fmt: skip
 _LAB_STEPS = {

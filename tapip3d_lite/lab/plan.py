@@ -40,6 +40,7 @@ class Plan:
         code: digests of the sources.
         clips: digests of the clips, once there are some.
         settled: results count as they are, whatever the code that made them was.
+        scratch: where a settled study's clips are simulated to be looked at; its own folder may not be writable.
     """
 
     folder: Path
@@ -50,6 +51,7 @@ class Plan:
     code: dict[str, str] = field(default_factory=source_code)
     clips: dict[str, str] | None = None
     settled: bool = False
+    scratch: Path = Path("runs/store")
     _steps: dict[str, int] = field(default_factory=dict, init=False)  # that fit into the budget's operations
 
     def to_dict(self) -> dict[str, Any]:
@@ -109,8 +111,8 @@ class Plan:
 
     @property
     def _clips(self) -> Path:
-        """Where clips are; what is shipped has none, and its folder may not be writable."""
-        return (Path("runs/store") if self.settled else self.store) / "clips" / self.budget.scene.__name__
+        """Where clips are."""
+        return (self.scratch if self.settled else self.store) / "clips" / self.budget.scene.__name__
 
     def _unchanged(self, **clips: tuple[Path, ...]) -> dict[str, str]:
         """Their digests; ValueError where an old study had others."""

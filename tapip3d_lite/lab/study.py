@@ -175,12 +175,17 @@ class Study:
 
     @flawed_on_purpose()
     def tracks(self, row: str, clip: str, seed: int = 0) -> tuple[Clip, Tracks]:
-        """A held-out clip as a row saw it, and the row's tracks; ValueError where these were not scored."""
+        """A held-out clip as a row saw it, and the row's tracks; ValueError where these were not scored, or weights are missing."""
         found = self.results().get(row, {}).get(seed, {})
         if clip not in found.get("scores", {}):
             raise ValueError(f"Study: row {row!r} has no scores of {clip!r} with seed {seed}; run the study first")
+        training = found["training"] and self.plan.store / "trainings" / found["training"]
+        if training and not (training / "weights.safetensors").exists():
+            raise ValueError(
+                f"Study: the weights of row {row!r}, seed {seed}, are not in {training}; a shipped table has those of seed 0"
+            )
         index, path = next((i, path) for i, path in enumerate(self.plan.judged) if path.stem == clip)
-        variant, training = self.plan.rows[row], found["training"] and self.plan.store / "trainings" / found["training"]
+        variant = self.plan.rows[row]
         seen = under(judged_clip(path, self.plan.budget), variant.degrade, index)
         custom = [] if training is None else self.plan.recipe(variant).custom
         return seen, tracker_of(variant, training, custom=custom).track(seen, **variant.options())

@@ -21,6 +21,7 @@ from tapip3d_lite.training.loss import FORMS, LossConfig
 from tapip3d_lite.training.motion import MotionConfig
 from tapip3d_lite.training.optimizers import OPTIMIZERS
 from tapip3d_lite.training.pretrain import MatchingConfig
+from tapip3d_lite.training.start import STARTS
 from tapip3d_lite.validate import check_names, check_range, check_state, check_types
 
 
@@ -52,7 +53,7 @@ class TrainConfig:
         average: the weights that are scored and saved are an exponential average over so many steps, or over a tenth of
             the steps done where that is less; 0: the last weights.
         head: standard deviation of the output layer's initial weights.
-        zero_blocks: the updater's blocks start as identities, with output projections of zero.
+        start: of the tracker's weights: `"random"`, or `"aligned"`, with attention that compares looks; see `start`.
         seed: of the random generators.
         evaluate_every: steps between evaluations on held-out clips.
         validation: number of held-out clips.
@@ -87,7 +88,7 @@ class TrainConfig:
     precision: str = "float32"
     average: int = 1000
     head: float = 0.01
-    zero_blocks: bool = False
+    start: str = "random"
     seed: int = 0
     evaluate_every: int = 1000
     validation: int = 8
@@ -117,6 +118,7 @@ class TrainConfig:
         if self.minutes is not None and self.minutes <= 0:
             raise ValueError(f"TrainConfig.minutes: expected a positive time or None, got {self.minutes}")
         check_names("TrainConfig.optimizer", [self.optimizer], OPTIMIZERS)
+        check_names("TrainConfig.start", [self.start], STARTS)
         if self.precision not in ("float32", "bfloat16"):
             raise ValueError(f'TrainConfig.precision: expected "float32" or "bfloat16", got {self.precision!r}')
         check_range(self, 1e-12, 1e3, "lr")

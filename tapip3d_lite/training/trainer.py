@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tapip3d_lite.model.blocks import Block
 from tapip3d_lite.model.registry import fast_step
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.model.weights import save_weights
@@ -34,6 +33,7 @@ from tapip3d_lite.training.pretrain import FramePair, matching_loss, take_encode
 from tapip3d_lite.training.recipe import TrainConfig, initial_weights
 from tapip3d_lite.training.run_folder import Bar, RunFolder
 from tapip3d_lite.training.schedule import Schedule
+from tapip3d_lite.training.start import align
 from tapip3d_lite.validate import check_state
 
 
@@ -93,9 +93,8 @@ class Trainer:
             self.tracker = Tracker(config.tracker_config()).to(device).train()
             if isinstance(head := getattr(self.tracker.updater, "head", None), nn.Linear):
                 nn.init.normal_(head.weight, std=config.head)
-            for block in self.tracker.updater.modules() if config.zero_blocks else ():
-                if isinstance(block, Block):
-                    block.start_as_identity()
+            if config.start == "aligned":
+                align(self.tracker)
         if config.init is not None:
             self.tracker.load_state_dict(initial_weights(config))
         self.folder = RunFolder(folder, config, resume)
