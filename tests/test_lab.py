@@ -489,7 +489,7 @@ def test_the_tables_of_the_paper_have_names(monkeypatch, capsys, tmp_path):
         assert all(row.given == "lite" for row in made.plan.rows.values()) == (
             made.plan.budget == lab.BUDGETS["shipped"]
         )
-    assert len(shared) == 14  # trainings of a seed, of 43 rows
+    assert len(shared) == 16  # trainings of a seed, of 46 rows
 
 
 @pytest.fixture(scope="module")
@@ -545,7 +545,9 @@ def test_shipped_tables_are_read_where_none_was_run(home, tmp_path, monkeypatch,
     made, _ = open_study("n2n", shipped=True)
     clip = next(iter(made.results()["n2n"][0]["scores"]))
     assert made.tracks("n2n", clip)[1].xyz.shape[0] == 4
-    with pytest.raises(ValueError, match="weights of row 'n2n', seed 1, are not in .* shipped table has those of seed 0"):
+    with pytest.raises(
+        ValueError, match=r"weights of row 'n2n', seed 1, are not in .* shipped table has those of seed 0"
+    ):
         made.draw("n2n", "klt", seed=1)
     assert "wrote" in call(monkeypatch, capsys, "report", "paper", "--out", "all")
     assert "Without results yet: blur." in (here / "all/report.md").read_text()

@@ -30,7 +30,7 @@ ROWS = {
     "standard": "AdamW, gradients through one update at a time, the average of the last weights",
     "last weights": "the same trainings, without the average (`--average 0`)",
     "muon": "Muon for the matrices inside blocks (`--optimizer muon`)",
-    "zeroinit": "the updater's output projections start at zero (`--zero-blocks`)",
+    "zeroinit": "the updater's output projections start at zero (part of `--start aligned`)",
     "muon-zeroinit": "both",
     "grad2": "gradients through two updates; not through Fourier features finer than degree 3, nor through pixels",
     "velocity": "a window's new frames start with constant velocity in place of the last position",

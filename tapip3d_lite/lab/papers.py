@@ -92,6 +92,9 @@ TABLES: dict[str, dict[str, Any]] = {
         "main table, DexYCB, a sensor's depth; without SceneTracker and camera space",
         {name: ({**one[0], **_SENSOR}, *one[2:]) for name, one in _SYSTEMS.items()},
     ),
+    "learner": _table(
+        "", {"aligned, Muon": ({},), "random start": ({"start": "random"},), "AdamW": ({"optimizer": "adamw"},)}
+    ),
     "K": _of_lite(
         "K at test, LSFOdyssey; 32, 16, 24, 48 of a training with 32 beside 9, 4, 7, 13 of one with 9",
         {
