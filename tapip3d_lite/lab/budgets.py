@@ -94,7 +94,7 @@ _FOCUSED = {  # all of the steps go into the world frame and into perfect depth
     "motion": MotionConfig(world=1.0, turned=0.0, sliding=0.0, wrong=0.0), "sensor": 0.0, "lr": 1.5e-3, "iterations": 2,
 }  # fmt: skip
 _LAB_STEPS = {
-    "clips": 240, "matching_steps": 1500, "steps": 1500, "average": 150, "evaluate_every": 250, "validation": 8,
+    "clips": 240, "matching_steps": 5000, "steps": 1500, "average": 150, "evaluate_every": 250, "validation": 8,
     "frames": 8, "sampling": SamplingConfig(tracks=48),
 }  # fmt: skip
 _TINY_STEPS = {
@@ -102,7 +102,7 @@ _TINY_STEPS = {
     "frames": (4, 6), "sampling": SamplingConfig(tracks=6),
 }  # fmt: skip
 BUDGETS = {
-    "lab": Budget(TrainConfig(tracker=_LAB, **_LAB_STEPS, **_FOCUSED)),
+    "lab": Budget(TrainConfig(tracker=_LAB, **_LAB_STEPS, **_FOCUSED), held_out=80),
     "tiny": Budget(TrainConfig(tracker=_TINY, **_TINY_STEPS, **_FOCUSED), tiny_scene, held_out=4, frames=6, points=12),
     # For rows that are not trained.
     "shipped": Budget(TrainConfig(clips=1, validation=0), shipped_scene, held_out=24, frames=16),
