@@ -22,7 +22,7 @@ _HOMES = {
     "simulate": ["SimulationConfig", "simulate_clip"],
     "evaluation.metrics": ["tapvid2d_metrics", "tapvid3d_metrics"],
     "evaluation.evaluate": ["evaluate"],
-    "export": ["export_tracks"],
+    "export": ["export_tracks", "serve_tracks"],
     "trackers": ["list_trackers", "load_tracker", "track_many"],
     "model.config": ["TrackerConfig"],
     "model.tracker": ["Tracker"],

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +14,7 @@ import numpy as np
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures.flat import check_drawable, track_colors
 from tapip3d_lite.files import atomic_path, check_suffix
-from tapip3d_lite.geometry import project
+from tapip3d_lite.geometry import invert, point_map, project, transform
 
 _TAIL = 8  # frames
 
@@ -24,9 +26,13 @@ def export_tracks(tracks: Tracks, path: str | Path, clip: Clip) -> None:
     - `.csv`: a line for each frame and track: frame, track, x, y, z (world), visible, u, v (pixels; empty behind the camera).
     - `.ply`: points with colours, `frame`, `track` and `visible`, and edges along the tracks (binary; world coordinates).
     - `.mp4` (MPEG-4), `.gif` (256 fixed colours): the video with the points, filled where visible, and their tails.
+    - `.glb`: the first frame's points and a line for each track, for Blender and others, in the first camera's
+      frame with y up and z backwards, as glTF has it (needs trimesh).
+    - `.rrd`: video, depth, camera, points and tails over the frames, for the Rerun viewer (needs rerun-sdk).
 
     Raises:
-        ValueError: another suffix, tracks of another length than the clip's, or OpenCV cannot write the film.
+        ValueError: another suffix, tracks of another length than the clip's, a package that is not installed, or OpenCV
+            cannot write the film.
     """
     write = WRITERS[check_suffix(path, *WRITERS)]
     check_drawable(clip, tracks)
@@ -103,10 +109,89 @@ def _gif(tracks: Tracks, path: Path, clip: Clip) -> None:
         raise ValueError(f"{path}: this OpenCV writes no GIF; choose .mp4")
 
 
+def _glb(tracks: Tracks, path: Path, clip: Clip) -> None:
+    trimesh = _extra("trimesh", "trimesh")
+    scene, paths = trimesh.Scene(), transform(tracks.xyz, clip.extrinsics[0]) * [1, -1, -1]
+    places, shades = _seen_points(clip, 0)
+    cloud = trimesh.PointCloud(transform(places, clip.extrinsics[0]) * [1, -1, -1], shades)
+    scene.add_geometry(cloud, node_name="frame 0")
+    for n, color in enumerate((track_colors(clip, tracks) * 255).astype(np.uint8)):
+        line = trimesh.path.entities.Line(np.arange(len(clip)), color=[*color.tolist(), 255])
+        scene.add_geometry(trimesh.path.Path3D([line], paths[:, n], process=False), f"track {n}", f"track {n}")
+    path.write_bytes(scene.export(file_type="glb"))
+
+
+def _rrd(tracks: Tracks, path: Path, clip: Clip) -> None:
+    rr = _extra("rerun", "rerun-sdk")
+    colors, film = track_colors(clip, tracks), rr.RecordingStream("tapip3d_lite")
+    film.save(path)
+    film.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
+    for t in range(len(clip)):
+        film.set_time("frame", sequence=t)
+        pose = invert(clip.extrinsics[t])
+        film.log("world/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+        film.log("world/camera/image", rr.Pinhole(image_from_camera=clip.intrinsics[t], resolution=clip.size[::-1]))
+        film.log("world/camera/image/video", rr.Image(clip.video[t]))
+        film.log("world/camera/image/depth", rr.DepthImage(clip.depths[t], meter=1.0))
+        seen, tails = tracks.visible[t], np.moveaxis(tracks.xyz[max(0, t - _TAIL) : t + 1], 1, 0)
+        film.log("world/tracks/visible", rr.Points3D(tracks.xyz[t, seen], colors=colors[seen]))
+        film.log("world/tracks/hidden", rr.Points3D(tracks.xyz[t, ~seen], colors=colors[~seen] / 2))
+        film.log("world/tracks/tails", rr.LineStrips3D(tails, colors=colors))
+    film.disconnect()
+
+
+def serve_tracks(tracks: Tracks, clip: Clip, port: int = 8080) -> Any:
+    """Show tracks in a browser by viser, with a slider over the frames; `stop()` of what is returned ends it.
+
+    ValueError where viser is not installed or tracks are not the clip's.
+    """
+    check_drawable(clip, tracks)
+    server, colors = _extra("viser", "viser").ViserServer(port=port), track_colors(clip, tracks)
+    pose = invert(clip.extrinsics[0])
+
+    @server.on_client_connect
+    def _(client: Any) -> None:  # behind the first camera, which looks along z with y down
+        client.camera.up_direction = -pose[:3, 1]
+        client.camera.position = pose[:3, 3] - 0.3 * pose[:3, 2]
+        client.camera.look_at = pose[:3, 3] + pose[:3, 2]
+
+    slider = server.gui.add_slider("frame", 0, len(clip) - 1, 1, 0)
+
+    def show(_: Any = None) -> None:
+        t = int(slider.value)
+        places, shades = _seen_points(clip, t)
+        server.scene.add_point_cloud("surfaces", places, shades, point_size=0.012)
+        shown = colors * np.where(tracks.visible[t], 1, 0.5)[:, None]
+        server.scene.add_point_cloud("tracks", tracks.xyz[t], shown, point_size=0.02)
+        tails = tracks.xyz[max(0, t - _TAIL) : t + 1]
+        pieces = np.stack([tails[:-1], tails[1:]], 2).reshape(-1, 2, 3)
+        server.scene.add_line_segments("tails", pieces, np.tile(colors[:, None], (len(tails) - 1, 2, 1)))
+
+    slider.on_update(show)
+    show()
+    return server
+
+
+def _seen_points(clip: Clip, t: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (P, 3) of a frame's known depths, and their colours (P, 3) uint8."""
+    depth = clip.depths[t]
+    known = np.isfinite(depth) & (depth > 0)
+    return point_map(depth, clip.intrinsics[t], clip.extrinsics[t])[known], clip.video[t][known]
+
+
+def _extra(module: str, package: str) -> Any:
+    try:
+        return import_module(module)
+    except ImportError:
+        raise ValueError(f"this needs `pip install {package}`, which is not installed") from None
+
+
 WRITERS: dict[str, Callable[[Tracks, Path, Clip], None]] = {
     ".npz": Tracks.save,
     ".csv": _csv,
     ".ply": _ply,
     ".mp4": _mp4,
     ".gif": _gif,
+    ".glb": _glb,
+    ".rrd": _rrd,
 }

@@ -1,6 +1,11 @@
 """Tracks written for other programs, read back; a suffix that is not known is refused."""
 
 import csv
+import json
+import re
+import subprocess
+import sys
+from urllib.request import urlopen
 
 import cv2
 import numpy as np
@@ -10,7 +15,7 @@ import pytest
 import tapip3d_lite as t3d
 from tapip3d_lite.export import overlay
 from tapip3d_lite.figures.flat import track_colors
-from tapip3d_lite.geometry import project
+from tapip3d_lite.geometry import project, transform
 
 
 @pytest.fixture(scope="module")
@@ -114,4 +119,76 @@ def test_an_unknown_suffix_writes_nothing(clip, tmp_path):
             write()
     with pytest.raises(ValueError, match="expected 4 frames"):
         t3d.export_tracks(clip.tracks, tmp_path / "a.csv", clip.cut(0, 4))
+    assert not list(tmp_path.iterdir())
+
+
+def test_glb(clip, tmp_path):
+    """glTF lines with their colours, in the first camera's frame with y up; read back by the same library."""
+    trimesh = pytest.importorskip("trimesh")
+    t3d.export_tracks(clip.tracks, tmp_path / "a.glb", clip)
+    scene = trimesh.load(tmp_path / "a.glb")
+    assert len(scene.geometry) == 8
+    for n in range(7):
+        pose, name = scene.graph[f"track {n}"]
+        line = scene.geometry[name]
+        places = trimesh.transform_points(np.asarray(line.vertices), pose)
+        path = transform(clip.tracks.xyz[:, n], clip.extrinsics[0]) * [1, -1, -1]
+        np.testing.assert_allclose(places, np.stack([path[:-1], path[1:]], 1).reshape(-1, 3), rtol=1e-5, atol=1e-6)
+    data = (tmp_path / "a.glb").read_bytes()  # the library that wrote them does not read lines' colours
+    size = int.from_bytes(data[12:16], "little")
+    head, body = json.loads(data[20 : 20 + size]), data[28 + size :]
+    meshes = {mesh["name"]: mesh["primitives"][0]["attributes"] for mesh in head["meshes"]}
+    for n, wanted in enumerate(np.rint(255 * track_colors(clip, clip.tracks))):
+        accessor = head["accessors"][meshes[f"track {n}"]["COLOR_0"]]
+        begin = head["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+        found = np.frombuffer(body, np.uint8, 4 * accessor["count"], begin).reshape(-1, 4)
+        assert np.abs(found[:, :3] - wanted).max() <= 1
+    _, name = scene.graph["frame 0"]
+    cloud = scene.geometry[name]
+    uv, z = project(np.asarray(cloud.vertices)[None] * [1, -1, -1], clip.intrinsics[:1])
+    column, row = np.rint(uv[0]).astype(int).T
+    np.testing.assert_allclose(z[0], clip.depths[0][row, column], rtol=1e-4)
+    np.testing.assert_array_equal(np.asarray(cloud.colors)[:, :3], clip.video[0][row, column])
+
+
+def test_rrd(clip, tmp_path):
+    pytest.importorskip("rerun")
+    t3d.export_tracks(clip.tracks, tmp_path / "a.rrd", clip)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
+    told = [sys.executable, "-m", "rerun", "rrd"]
+    subprocess.run([*told, "verify", tmp_path / "a.rrd"], check=True, capture_output=True)
+    text = subprocess.run([*told, "print", "-v", tmp_path / "a.rrd"], check=True, capture_output=True, text=True).stdout
+    for part in (
+        "tracks/visible",
+        "tracks/hidden",
+        "tracks/tails",
+        "camera",
+        "camera/image/video",
+        "camera/image/depth",
+    ):
+        assert re.search(rf"with 5 rows .* - /world/{part} ", text), part
+
+
+def test_tracks_are_served_by_viser(clip):
+    viser = pytest.importorskip("viser")
+    server = t3d.serve_tracks(clip.tracks, clip, port=18923)
+    try:
+        assert isinstance(server, viser.ViserServer)
+        with urlopen("http://localhost:18923") as page:
+            assert b"viser" in page.read().lower()
+    finally:
+        server.stop()
+    with pytest.raises(ValueError, match="frames"):
+        t3d.serve_tracks(clip.tracks, clip.cut(0, 3))
+
+
+@pytest.mark.parametrize(("name", "package"), [("a.glb", "trimesh"), ("a.rrd", "rerun-sdk"), ("", "viser")])
+def test_what_needs_another_package_says_so(clip, tmp_path, monkeypatch, name, package):
+    for module in ("trimesh", "rerun", "viser"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ValueError, match=f"pip install {package}"):
+        if name:
+            t3d.export_tracks(clip.tracks, tmp_path / name, clip)
+        else:
+            t3d.serve_tracks(clip.tracks, clip)
     assert not list(tmp_path.iterdir())
