@@ -11,6 +11,7 @@ from tapip3d_lite.bundle import Pair, _errors, motion, small
 from tapip3d_lite.geometry import invert, project
 from tapip3d_lite.poses import _median, _smooth, move
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade, wrong_poses
+from tests.pose_errors import centres_apart, steps_apart
 
 
 @pytest.fixture(scope="module", params=[(1, "arc"), (2, "handheld")], ids=lambda p: p[1])
@@ -203,3 +204,26 @@ def test_derivatives_are_those_of_the_errors():
             for s in (1, -1)
         ]  # fmt: skip
         np.testing.assert_allclose(by[:, :, i], (ends[0] - ends[1]) / 2e-5, rtol=1e-4, atol=1e-4)
+
+
+def test_errors_of_poses_are_those_of_the_definitions():
+    """Of a rigid motion of everything no ATE is left; a turn of each camera about itself is all RPE of angle."""
+    rng = np.random.default_rng(0)
+    truth = np.repeat(np.eye(4)[None], 6, 0)
+    truth[:, :3, 3] = rng.normal(size=(6, 3))
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0], [1, 2, 3]
+    assert centres_apart(truth @ world, truth) == pytest.approx(0, abs=1e-9)
+    assert steps_apart(truth @ world, truth) == pytest.approx((0, 0), abs=1e-9)
+    away = truth.copy()
+    away[3, :3, 3] += [0.3, 0, 0]
+    plain = np.sqrt(((truth - away)[:, :3, 3] ** 2).sum(1).mean())
+    assert 0.3 * plain < centres_apart(away, truth) < plain
+    assert steps_apart(away, truth)[0] == pytest.approx(0.3 * np.sqrt(2 / 5)) and steps_apart(away, truth)[1] == 0
+    turned = truth.copy()
+    turned[1::2] = (
+        np.block([[cv2.Rodrigues(np.array([0, np.radians(2), 0]))[0], np.zeros((3, 1))], [0, 0, 0, 1]]) @ turned[1::2]
+    )
+    assert steps_apart(turned, truth)[1] == pytest.approx(2) and centres_apart(turned, truth) == pytest.approx(
+        0, abs=1e-9
+    )

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from lessons import milestone
+from lessons import milestone, n05
 from lessons.checker import cases_of, judge
 from lessons.n05 import (
     converging,
@@ -276,3 +276,18 @@ def test_both_ways_is_what_the_library_does(tracker, clip, queries):
             found = joined(way(frames), way(frames.flip()), queries)
             np.testing.assert_allclose(found, whole.xyz, atol=1e-4)
         assert queries[4, 0] == 5 and np.abs(way(frames)(queries)[:5, 4] - whole.xyz[:5, 4]).max() > 1e-3
+
+
+def test_the_last_digit_stays_where_neighbours_and_fine_waves_do():
+    """And what is held is what was there before: nothing moves where the queries do not."""
+    clip = t3d.simulate_clip(3, frames=8, size=(64, 64), tracks=40)
+    seen = np.flatnonzero(clip.tracks.visible[0])[:6]
+    queries = np.concatenate([np.zeros((6, 1)), clip.tracks.xyz[0, seen]], 1).astype(np.float32)
+    tracker = t3d.load_tracker("lite", fast=False)
+    far = {kept: n05.grown(tracker, clip, queries, kept) for kept in ((), ("neighbours", "fine waves"))}
+    assert far[()].shape == (tracker.config.iterations, 8, 6) and np.isfinite(far[()]).all()
+    assert far["neighbours", "fine waves"].max() < 1e-5 and far[()].max() > 10 * far["neighbours", "fine waves"].max()
+    n05.growth_chart({"a": far[()][:, 0], "b": np.zeros((3, 6))}, 3).canvas.draw()
+    whole, deaf = (n05.without_waves("lite", degree).track(clip, queries).xyz for degree in (13, 3))
+    np.testing.assert_array_equal(whole, tracker.track(clip, queries).xyz)
+    assert np.abs(deaf - whole).max() > 1e-3

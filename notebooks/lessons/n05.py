@@ -14,10 +14,12 @@ from torch import Tensor, nn
 from lessons.checker import check
 from lessons.guesses import reveal
 from lessons.milestone import Use, milestone
+from lessons.n05_digits import grown, without_waves
 from lessons.n05_exercises import EXERCISES
 from lessons.n05_figures import (
     corrections,
     cost_chart,
+    growth_chart,
     heard,
     interval,
     looks_over_time,
@@ -44,6 +46,8 @@ __all__ = [
     "cost_chart",
     "explore",
     "film",
+    "grown",
+    "growth_chart",
     "heard",
     "hearing",
     "in_use",
@@ -64,6 +68,7 @@ __all__ = [
     "token_parts",
     "windows_chart",
     "without",
+    "without_waves",
 ]
 
 BOTH_WAYS = True  # the milestone asks for points in all frames, and tracks them both ways in time

@@ -172,3 +172,28 @@ def paired(differences: Mapping[str, np.ndarray], xlabel: str) -> Figure:
     ax.set_yticks(range(len(differences)), list(differences), fontsize=9)
     ax.set_ylim(len(differences) - 0.5, -0.5)
     return figure
+
+
+def growth_chart(rows: Mapping[str, np.ndarray], updates: int) -> Figure:
+    """How far estimates move, in metres, update by update: medians as lines, the middle nine tenths as bands.
+
+    Args:
+        rows: by name (updates of all windows, points), NaN where there is no estimate.
+        updates: of one window.
+    """
+    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
+    ax = figure.subplots()
+    looks = ((OKABE[1], "o", "-"), (OKABE[4], "s", "--"), (OKABE[2], "^", ":"))
+    for (name, values), (color, marker, line) in zip(rows.items(), looks, strict=True):
+        x = np.arange(1, len(values) + 1)
+        low, middle, high = np.nanpercentile(values, [5, 50, 95], axis=1) + 1e-8
+        ax.fill_between(x, low, high, color=color, alpha=0.15, lw=0)
+        ax.plot(x, middle, line, color=color, marker=marker, ms=5, label=name)
+    for edge in range(updates, len(x), updates):
+        ax.axvline(edge + 0.5, color=INK, lw=0.8, ls=":")
+    ax.set_yscale("log")
+    ax.set_xticks(x)
+    label_axes(ax, "moved (m)", "update (dotted: the next window)")
+    ax.legend(fontsize=9, frameon=False)
+    ax.tick_params(labelsize=9)
+    return figure
