@@ -184,7 +184,7 @@ def growth_chart(rows: Mapping[str, np.ndarray], updates: int) -> Figure:
     figure = Figure(figsize=(8.2, 3.6), layout="constrained")
     ax = figure.subplots()
     looks = ((OKABE[1], "o", "-"), (OKABE[4], "s", "--"), (OKABE[2], "^", ":"))
-    for (name, values), (color, marker, line) in zip(rows.items(), looks, strict=True):
+    for (name, values), (color, marker, line) in zip(rows.items(), looks, strict=False):
         x = np.arange(1, len(values) + 1)
         low, middle, high = np.nanpercentile(values, [5, 50, 95], axis=1) + 1e-8
         ax.fill_between(x, low, high, color=color, alpha=0.15, lw=0)

@@ -20,7 +20,7 @@ from lessons.progress import collect, in_use, progress, reset
 from lessons.verdict import Verdict
 from lessons.widgets import explore
 from tapip3d_lite.lab import BUDGETS, Budget, Study
-from tapip3d_lite.lab.papers import open_study
+from tapip3d_lite.lab.papers import PAPER, TABLES, open_study
 from tapip3d_lite.lab.statistics import paired
 from tapip3d_lite.lab.table import Table
 
@@ -48,9 +48,15 @@ __all__ = [
     "reveal_order",
     "shipped",
     "show",
+    "tables",
     "with_itself",
     "with_itself_chart",
 ]
+
+
+def tables() -> list[str]:
+    """Names of the tables that the library brings along."""
+    return [name for name in TABLES if (PAPER / name / "study.json").exists()]
 
 
 def shipped(name: str, scratch: Path = Path("../runs/store")) -> tuple[Study, str]:
