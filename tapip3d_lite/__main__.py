@@ -43,8 +43,7 @@ def track(
     tracker: Annotated[str, arg(help="a name of `list_trackers()` or a weights file")] = "lite",
     format: Format = "auto",
     out: Annotated[
-        tuple[Path, ...],
-        arg(help="results: npz (the authors' format), csv, ply, mp4, gif, glb or rrd, by their suffix"),
+        tuple[Path, ...], arg(help="results: npz (the authors'), csv, ply, mp4, gif, glb or rrd, by their suffix")
     ] = (),
     html: Annotated[Path | None, arg(help="3D page with a time slider")] = None,
     png: Annotated[Path | None, arg(help="picture of frames with tracks")] = None,

@@ -101,12 +101,6 @@ class Block(nn.Module):
         x = x + self.attention(normed, seen, mask)
         return x + self.mlp(self.norm(x))
 
-    def start_as_identity(self) -> None:
-        """Zero the output projections: the block then passes x on until its training begins."""
-        for layer in (self.attention.to_out, self.mlp[-1]):
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
-
 
 class Pool(nn.Module):
     """One learned token gathers a bag: no norms, no residual."""

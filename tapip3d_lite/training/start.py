@@ -26,6 +26,14 @@ SHARPNESS = 50.0  # logits of the attention at a cosine of 1
 _OFFSETS, _MOTION, _PIXELS = 3, 4, 2  # finest degrees that keep their weights
 
 
+def begin(tracker: Tracker, start: str, head: float) -> None:
+    """Let a random tracker start as one of `STARTS`, with `head` as the standard deviation of the output layer's weights."""
+    if isinstance(last := getattr(tracker.updater, "head", None), nn.Linear):
+        nn.init.normal_(last.weight, std=head)
+    if start == "aligned":
+        align(tracker)
+
+
 @torch.no_grad()
 def align(tracker: Tracker) -> None:
     """Change a random tracker into one that starts aligned; parts of other kinds than the library's stay as they are."""
@@ -43,7 +51,9 @@ def align(tracker: Tracker) -> None:
     for block in (part for part in context.modules() if isinstance(part, Block) and part.norm_context is not None):
         _compare(block, looks)
     for block in (part for part in updater.modules() if isinstance(part, Block)):
-        block.start_as_identity()
+        for layer in (block.attention.to_out, block.mlp[-1]):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
     if isinstance(first := getattr(updater, "input", None), nn.Linear) and first.in_features == tracker.time.shape[1]:
         pixels = first.in_features - (2 * FACTOR if tracker.config.use_uv else 0)
         _fade(first.weight[:, pixels - 6 * FACTOR : pixels], 6, _MOTION)

@@ -33,7 +33,7 @@ from tapip3d_lite.training.pretrain import FramePair, matching_loss, take_encode
 from tapip3d_lite.training.recipe import TrainConfig, initial_weights
 from tapip3d_lite.training.run_folder import Bar, RunFolder
 from tapip3d_lite.training.schedule import Schedule
-from tapip3d_lite.training.start import align
+from tapip3d_lite.training.start import begin
 from tapip3d_lite.validate import check_state
 
 
@@ -91,10 +91,7 @@ class Trainer:
         with torch.random.fork_rng():  # leaves the caller's random generator as it is
             torch.manual_seed(config.seed)
             self.tracker = Tracker(config.tracker_config()).to(device).train()
-            if isinstance(head := getattr(self.tracker.updater, "head", None), nn.Linear):
-                nn.init.normal_(head.weight, std=config.head)
-            if config.start == "aligned":
-                align(self.tracker)
+            begin(self.tracker, config.start, config.head)
         if config.init is not None:
             self.tracker.load_state_dict(initial_weights(config))
         self.folder = RunFolder(folder, config, resume)
