@@ -14,7 +14,7 @@ from tapip3d_lite.files import write_text
 from tapip3d_lite.lab.papers import PAPER, TABLES, open_study
 from tapip3d_lite.training.run_folder import read_log
 
-_EVERY = 10  # steps of the learning curve
+_EVERY = 10  # steps of the learning curve, beside those with held-out scores
 
 
 def pack(name: str, folder: Path) -> list[str]:
@@ -25,7 +25,8 @@ def pack(name: str, folder: Path) -> list[str]:
     if missing:
         return missing
     plan.folder, source = folder / name, plan.folder
-    plan.save()
+    plan.folder.mkdir(parents=True)
+    shutil.copy(source / "study.json", plan.folder)  # with the code that made the results, which need not be today's
     for row, seeds in results.items():
         for seed, one in seeds.items():
             write_text(plan.result(plan.rows[row], seed), json.dumps(one, separators=(",", ":")) + "\n")
@@ -34,7 +35,10 @@ def pack(name: str, folder: Path) -> list[str]:
             t3d.save_weights(
                 t3d.load_tracker(old / "weights.safetensors", fast=False), new / "weights.safetensors", half=True
             )
-            write_text(new / "log.jsonl", "".join(json.dumps(line) + "\n" for line in read_log(old)[::_EVERY]))
+            kept = [
+                x for i, x in enumerate(read_log(old)) if not i % _EVERY or any(name.startswith("val_") for name in x)
+            ]
+            write_text(new / "log.jsonl", "".join(json.dumps(line) + "\n" for line in kept))
     print(f"{source} → {plan.folder}: {len(results)} rows")
     return []
 
