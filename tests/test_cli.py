@@ -82,7 +82,10 @@ def test_evaluate_prints_a_table_with_means(clip_file):
         (["check", "absent.npz"], "no such file"),
         (["check", "CLIP", "--format", "tum"], "format tum is that of a folder"),
         (["convert", "CLIP", "clip.mat"], "written as NAME.npz"),
-        (["track", "CLIP", "--out", "tracks.xyz"], "this is written as .npz, .csv, .ply, .mp4, .gif, got .xyz"),
+        (
+            ["track", "CLIP", "--out", "tracks.xyz"],
+            "this is written as .npz, .csv, .ply, .mp4, .gif, .glb, .rrd, got .xyz",
+        ),
         (["import", "absent.pth", "out.safetensors"], "no such file"),
         (["card", "absent", "results.json", "--hardware", "x"], "not a finished training"),
         (["curves", "absent"], "absent"),

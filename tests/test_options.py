@@ -25,7 +25,8 @@ from tapip3d_lite.model.track import track
 from tapip3d_lite.training.recipe import TrainConfig
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data_samples" / "arc.npz"
-ELSEWHERE = {"from_official_state", "load_official"}  # without options; test_weights has the checkpoints that they need
+# Those without options, since test_weights has the checkpoints that they need; and what asks for viser, in test_export.
+ELSEWHERE = {"from_official_state", "load_official", "serve_tracks"}
 SIMULATION = {
     "frames": 4, "fps": 10.0, "size": (32, 40), "camera": "handheld", "handheld": 2.0, "arc": (20.0, 40.0),
     "moving": (3, 5), "resting": (1, 2), "shapes": ("box", "gear"), "speed": 0.9, "drop": 0.8, "sky": True,
