@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import tapip3d_lite as t3d
-from lessons import n10, n10_measure, progress
-from lessons.checker import check
+from lessons import n10, n10_measure
 from lessons.n10_folder import START, quaternion
 from lessons.widgets import PointPicker
 from tapip3d_lite.depth import _matched
 from tapip3d_lite.evaluation.intervals import Estimate
 from tapip3d_lite.geometry import invert, transform
+from tests.milestones import notices
 
 
 @pytest.fixture(scope="module")
@@ -159,17 +159,5 @@ def test_a_click_becomes_a_query(source):
 
 
 def test_the_milestone_notices_what_is_not_the_librarys():
-    progress.reset("10")
-    assert n10.milestone("10", tracker="static").status == "not attempted"
-    for exercise in n10.EXERCISES:
-        assert check(exercise.name, lambda *case, right=exercise.reference: right(*case)).status == "passed"
-    said = n10.milestone("10", tracker="static")
-    assert said.status == "passed" and "yours" in said.message
-    told = ("thousand", "no limit", "turned", "no check", "not aligned")
-    for exercise, slip in zip(n10.EXERCISES, told, strict=True):
-        mistake = next(m for m in exercise.mistakes if m.name == slip)
-        progress.record(exercise.name, mistake.answer, "passed")
-        assert n10.milestone("10", tracker="static").status == "wrong", exercise.name
-        progress.record(exercise.name, lambda *case, right=exercise.reference: right(*case), "passed")
-    progress.reset("10")
+    notices(n10, "10", ("thousand", "no limit", "turned", "no check", "not aligned"), tracker="static")
     assert n10_measure.carried is n10.EXERCISES[2].reference  # nothing stays plugged in

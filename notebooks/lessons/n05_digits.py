@@ -12,9 +12,10 @@ from torch import Tensor, nn
 
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.model import blocks, neighbors, updater
-from tapip3d_lite.model.blocks import DEGREES, FACTOR, OffsetEmbedding
+from tapip3d_lite.model.blocks import DEGREES
 from tapip3d_lite.recorder import Recorder
 from tapip3d_lite.trackers import load_tracker
+from tapip3d_lite.training.start import by_degree, wave_weights
 
 Array = np.ndarray
 
@@ -70,8 +71,7 @@ def _holding(
 
     def fourier(x: Tensor) -> Tensor:
         found = waves(x)
-        fine = torch.tensor([j > degree for j in DEGREES]).repeat_interleave(x.shape[-1])
-        fine = torch.cat([fine.new_zeros(x.shape[-1]), fine, fine])
+        fine = by_degree([j > degree for j in DEGREES], x.shape[-1], plain=False)
         return torch.where(fine, held(found), found)
 
     with mock.patch.object(neighbors, "knn", knn if "neighbours" in kept else search):
@@ -84,12 +84,6 @@ def _holding(
 def without_waves(name: str, degree: int) -> nn.Module:
     """A tracker by name, without fast parts, that hears no sines and cosines above a degree."""
     tracker = load_tracker(name, fast=False)
-    heard = [(part[1].weight, 3) for part in tracker.modules() if isinstance(part, OffsetEmbedding)]
-    first = tracker.updater.input.weight
-    pixels = first.shape[1] - (2 * FACTOR if tracker.config.use_uv else 0)
-    heard += [(first[:, pixels - 6 * FACTOR : pixels], 6)]
-    heard += [(first[:, pixels:], 2)] if tracker.config.use_uv else []
-    for weight, axes in heard:
-        coarse = torch.tensor([j <= degree for j in DEGREES]).repeat_interleave(axes)
-        weight *= torch.cat([coarse.new_ones(axes), coarse, coarse])
+    for weight, axes in wave_weights(tracker):
+        weight *= by_degree([float(j <= degree) for j in DEGREES], axes)
     return tracker

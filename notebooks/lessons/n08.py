@@ -14,7 +14,7 @@ from lessons.milestone import Use, plugged, report
 from lessons.n07_figures import differences_chart
 from lessons.n08_exercises import EXERCISES
 from lessons.n08_figures import by_seed_and_clip, power_chart, with_itself_chart
-from lessons.n08_trials import differences, excludes_zero, matrix, over_clips, parts_of, with_itself
+from lessons.n08_trials import differences, excludes_zero, over_clips, parts_of, with_itself
 from lessons.pictures import pipeline, show
 from lessons.progress import collect, in_use, progress, reset
 from lessons.verdict import Verdict
@@ -22,7 +22,7 @@ from lessons.widgets import explore
 from tapip3d_lite.lab import BUDGETS, Budget, Study
 from tapip3d_lite.lab.papers import PAPER, TABLES, open_study
 from tapip3d_lite.lab.statistics import paired
-from tapip3d_lite.lab.table import Table
+from tapip3d_lite.lab.table import Table, matrix
 
 __all__ = [
     "EXERCISES",
@@ -35,7 +35,6 @@ __all__ = [
     "excludes_zero",
     "explore",
     "in_use",
-    "matrix",
     "milestone",
     "over_clips",
     "parts",
@@ -98,12 +97,12 @@ def reveal_order(
         text = f"expected the names {', '.join(rows)}, best first, or {SHOW!r}; got {guess!r}."
         return Revealed(Verdict("sealed", text), None)
     results = study.results()
-    scores = {row: matrix(results, row, metric) for row in rows}
+    scores = {row: matrix(results[row], metric) for row in rows}
     decided, missed = 0, []
     for i, one in enumerate(guess):
         for other in guess[i + 1 :]:
             found = paired(scores[one], scores[other])
-            decided += found.low > 0 or found.high < 0
+            decided += excludes_zero(found)
             missed += [f"{other} is better than {one}"] if found.high < 0 else []
     text = f"of {len(rows) * (len(rows) - 1) // 2} pairs this study decides {decided}; your order has {decided - len(missed)} of them"
     return Revealed(Verdict("wrong" if missed else "passed", "; ".join([text, *missed])), then)

@@ -3,52 +3,50 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
 from tapip3d_lite.evaluation.intervals import Estimate
-from tapip3d_lite.lab.statistics import student
+from tapip3d_lite.lab.statistics import Effect, effect
+from tapip3d_lite.lab.table import Results, matrix
 
 Array = np.ndarray
-Results = Mapping[str, Mapping[int, Mapping[str, Any]]]
-
-
-def matrix(results: Results, row: str, metric: str) -> Array:
-    """A trained row's scores (S, C) by seed and clip; NaN where one is undefined."""
-    seeds = [results[row][seed]["scores"] for seed in sorted(results[row])]
-    return np.array([[one[clip][metric] for clip in sorted(one)] for one in seeds], float)
 
 
 def differences(results: Results, one: str, other: str, metric: str) -> Array:
     """Scores of one row minus another's (S, C), by seed and clip, without clips where one is undefined."""
-    d = matrix(results, one, metric) - matrix(results, other, metric)
+    d = matrix(results[one], metric) - matrix(results[other], metric)
     return d[:, ~np.isnan(d).any(0)]
 
 
 def over_clips(d: Array) -> Estimate:
     """The mean of differences (C,) with a 95 % interval that takes clips for the only thing that was drawn."""
-    half = student(0.05, len(d) - 1) * float(d.std(ddof=1)) / math.sqrt(len(d))
-    return Estimate(float(d.mean()), float(d.mean()) - half, float(d.mean()) + half)
+    found = effect(d[None], drawn=False)
+    return Estimate(found.mean, found.low, found.high)
 
 
 def with_itself(studies: Sequence[Results], metric: str) -> dict[str, Estimate]:
-    """Every trained row of some studies compared with itself, one seed with another, by intervals over clips alone."""
-    found = {}
+    """Every trained row of some studies compared with itself, one seed with another, by intervals over clips alone.
+
+    Rows that share their trainings count once.
+    """
+    found, known = {}, set()
     for results in studies:
         for row, seeds in results.items():
-            if len(seeds) < 2:
+            trainings = tuple(one["training"] for one in seeds.values())
+            if len(seeds) < 2 or trainings in known:
                 continue
-            scores = matrix(results, row, metric)
+            known.add(trainings)
+            scores = matrix(seeds, metric)
             for i, j in combinations(range(len(scores)), 2):
                 d = scores[i] - scores[j]
                 found[f"{row}: seed {i} - seed {j}"] = over_clips(d[~np.isnan(d)])
     return found
 
 
-def excludes_zero(one: Estimate) -> bool:
+def excludes_zero(one: Estimate | Effect) -> bool:
     """Whether an interval leaves 0 out."""
     return one.low > 0 or one.high < 0
 

@@ -138,10 +138,7 @@ def track_costs(tracker: TrackerLike, clip: Clip, options: dict[str, Any]) -> di
     """Parameters, and multiply-adds for each query and frame of a call of `track`, its encoder included."""
     if not isinstance(tracker, Tracker):
         return {}
-    tracker.requires_grad_(False)  # the counter would ask views of parameters, which have no history here, for theirs
-    with FlopCounterMode(display=False) as counter:
-        tracker.track(clip, **options)
-    count = counter.get_total_flops() / 2 / len(clip) / len(clip.queries)
+    count = _counted(tracker, clip, options)["Global"] / 2 / len(clip) / len(clip.queries)
     return {"parameters": sum(p.numel() for p in tracker.parameters()), "multiply_adds": round(count)}
 
 
@@ -157,16 +154,22 @@ def step_flops(recipe: TrainConfig) -> float:
         queries = np.tile(np.float32([0, 0, 0, 1]), (recipe.sampling.tracks, 1))
         flat = np.ones((frames, height, width), np.float32)
         clip = Clip(np.zeros((*flat.shape, 3), np.uint8), flat, *cameras, queries)
-        with FlopCounterMode(display=False) as counter:
-            tracker.track(clip, support_grid=0, iterations=iterations)
-        of = {part: sum(counts.values()) for part, counts in counter.get_flop_counts().items()}
+        of = _counted(tracker, clip, {"support_grid": 0, "iterations": iterations})
         return of["Global"] - (0 if recipe.train_encoder else of[type(tracker.encoder).__name__])
 
-    tracker = Tracker(recipe.tracker_config()).eval().requires_grad_(False)
+    tracker = Tracker(recipe.tracker_config()).eval()
     height, width = tracker.config.image_size
     (few, many), (least, most) = recipe.frames, recipe.iterations
     start, rest = forward(few, least), [forward(s, m) for s in {few, many} for m in {least, most}]
     return 3 * recipe.batch * (recipe.short * start + (1 - recipe.short) * statistics.mean(rest))
+
+
+def _counted(tracker: Tracker, clip: Clip, options: dict[str, Any]) -> dict[str, int]:
+    """Floating-point operations of a call of `track`, by the module that does them; `"Global"`: all."""
+    tracker.requires_grad_(False)  # the counter would ask views of parameters, which have no history here, for theirs
+    with FlopCounterMode(display=False) as counter:
+        tracker.track(clip, **options)
+    return {part: sum(counts.values()) for part, counts in counter.get_flop_counts().items()}
 
 
 def step_costs(folder: Path) -> dict[str, float]:

@@ -93,13 +93,12 @@ TABLES: dict[str, dict[str, Any]] = {
         {name: ({**one[0], **_SENSOR}, *one[2:]) for name, one in _SYSTEMS.items()},
     ),
     "learner": _table(
-        "",
-        {
-            "aligned, Muon": ({},), "grey video": ({"degrade": {"grey": True}},),
-            "frozen depth": ({"degrade": {"frozen": "depths"}},), "random start": ({"start": "random"},),
-            "AdamW": ({"optimizer": "adamw"},), **{name: ({"tracker": name},) for name in ("static", "klt")},
-        },
+        "", {"aligned, Muon": ({},), "random start": ({"start": "random"},), "AdamW": ({"optimizer": "adamw"},)}
     ),
+    "controls": _table("", {
+        "n2n": ({},), "grey video": ({"degrade": {"grey": True}},), "frozen depth": ({"degrade": {"frozen": "depths"}},),
+        "static": ({"tracker": "static"},), "klt": ({"tracker": "klt"},),
+    }),
     "K": _of_lite(
         "K at test, LSFOdyssey; 32, 16, 24, 48 of a training with 32 beside 9, 4, 7, 13 of one with 9",
         {

@@ -84,8 +84,7 @@ class Study:
         names = [row.name for row in rows]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"Study: two rows are called {', '.join(twice)}; rename one")
-        changes = {"steps": steps, "minutes": minutes, "flops": flops}
-        changes = {name: value for name, value in changes.items() if value is not None}
+        changes = {k: v for k, v in (("steps", steps), ("minutes", minutes), ("flops", flops)) if v is not None}
         if not rows or len(changes) > 1:
             raise ValueError(
                 f"Study: expected rows, at most one of steps, minutes and flops; got {len(rows)} rows, {changes}"

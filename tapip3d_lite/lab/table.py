@@ -91,7 +91,7 @@ def compare(results: Results, against: str, metrics: Sequence[str]) -> Table:
         failed = next((x["failed"] for x in results[name].values() if "failed" in x), None)
         rows.append({"row": name, "seeds": len(seeds) if _drawn(seeds) else None, "failed": failed, **_costs(seeds)})
         for metric in metrics:
-            rows[-1][metric] = asdict(effect(_matrix(seeds, metric), _drawn(seeds)) if seeds else Effect(math.nan))
+            rows[-1][metric] = asdict(effect(matrix(seeds, metric), _drawn(seeds)) if seeds else Effect(math.nan))
             if name != against and (found := difference(seeds, base, metric)):
                 compared.append(rows[-1][metric])
                 effects.append(found)
@@ -105,7 +105,7 @@ def difference(ours: Seeds, theirs: Seeds, metric: str) -> Effect | None:
     ours, theirs = _scored(ours), _scored(theirs)
     one, other = _common(ours, theirs)
     drawn = _drawn(ours) or _drawn(theirs)
-    return paired(_matrix(ours, metric, one), _matrix(theirs, metric, other), drawn) if one else None
+    return paired(matrix(ours, metric, one), matrix(theirs, metric, other), drawn) if one else None
 
 
 def gaps_by_clip(
@@ -121,7 +121,7 @@ def gaps_by_clip(
     pairs = [pair for pair in zip(*_common(*both), strict=True) if seed is None or seed in pair]
     if not pairs:
         raise ValueError(f"{one!r} and {other!r} have no scores with the same seed; run the study first")
-    means = [_matrix(x, metric, some).mean(0) for x, some in zip(both, zip(*pairs, strict=True), strict=True)]
+    means = [matrix(x, metric, some).mean(0) for x, some in zip(both, zip(*pairs, strict=True), strict=True)]
     names = sorted(both[0][pairs[0][0]]["scores"])
     gaps = [(name, float(gap)) for name, gap in zip(names, means[0] - means[1], strict=True) if not math.isnan(gap)]
     return sorted(gaps, key=lambda pair: -abs(pair[1]))
@@ -145,7 +145,7 @@ def _common(one: Seeds, other: Seeds) -> tuple[list[int], list[int]]:
     return tuple(common if _drawn(x) else [0] * len(common) for x in (one, other))
 
 
-def _matrix(seeds: Seeds, metric: str, some: Sequence[int] | None = None) -> np.ndarray:
+def matrix(seeds: Seeds, metric: str, some: Sequence[int] | None = None) -> np.ndarray:
     """A metric (S, C) of one row by seed and clip, in the order of their names; NaN where it is undefined."""
     found = [seeds[seed]["scores"] for seed in (seeds if some is None else some)]
     return np.array([[scores[clip].get(metric) for clip in sorted(scores)] for scores in found], float)  # None: NaN

@@ -13,6 +13,7 @@ same. From random weights a small tracker does not use colour within its first t
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +24,7 @@ from tapip3d_lite.model.tracker import Tracker
 
 STARTS = ("random", "aligned")
 SHARPNESS = 50.0  # logits of the attention at a cosine of 1
-_OFFSETS, _MOTION, _PIXELS = 3, 4, 2  # finest degrees that keep their weights
+_FINEST = {3: 3, 6: 4, 2: 2}  # degrees that keep their weights, by axes: of offsets, motion, pixels
 
 
 def begin(tracker: Tracker, start: str, head: float) -> None:
@@ -37,42 +38,47 @@ def begin(tracker: Tracker, start: str, head: float) -> None:
 @torch.no_grad()
 def align(tracker: Tracker) -> None:
     """Change a random tracker into one that starts aligned; parts of other kinds than the library's stay as they are."""
-    for part in tracker.modules():
-        if isinstance(part, OffsetEmbedding):
-            _fade(part[1].weight, 3, _OFFSETS)
+    for weight, axes in wave_weights(tracker):
+        factors = by_degree([2.0 ** min(0, _FINEST[axes] - j) for j in DEGREES], axes).to(weight)
+        weight *= factors / factors.square().mean().sqrt()  # their mean square stays
     context, updater = (x if isinstance(x, nn.Module) else nn.Module() for x in (tracker.context, tracker.updater))
-    looks = tracker.config.feature_dim
-    for embed in (part for part in context.modules() if isinstance(part, CellEmbedding)):
-        if tracker.config.token_dim > looks:
-            nn.init.zeros_(embed.project.bias)
-            nn.init.eye_(embed.project.weight)
-            for offsets in embed.offsets:
-                nn.init.zeros_(offsets[-1].weight[:looks])
+    looks, split = tracker.config.feature_dim, tracker.config.token_dim > tracker.config.feature_dim
+    for embed in (part for part in context.modules() if split and isinstance(part, CellEmbedding)):
+        nn.init.zeros_(embed.project.bias)
+        nn.init.eye_(embed.project.weight)
+        for offsets in embed.offsets:
+            nn.init.zeros_(offsets[-1].weight[:looks])
     for block in (part for part in context.modules() if isinstance(part, Block) and part.norm_context is not None):
         _compare(block, looks)
     for block in (part for part in updater.modules() if isinstance(part, Block)):
         for layer in (block.attention.to_out, block.mlp[-1]):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
-    if isinstance(first := getattr(updater, "input", None), nn.Linear) and first.in_features == tracker.time.shape[1]:
+
+
+def wave_weights(tracker: Tracker) -> Iterator[tuple[Tensor, int]]:
+    """Columns of weights that read `fourier`, with the number of axes: 3 of offsets, 6 of motion, 2 of pixels."""
+    for part in tracker.modules():
+        if isinstance(part, OffsetEmbedding):
+            yield part[1].weight, 3
+    first = getattr(tracker.updater, "input", None)
+    if isinstance(first, nn.Linear) and first.in_features == tracker.time.shape[1]:
         pixels = first.in_features - (2 * FACTOR if tracker.config.use_uv else 0)
-        _fade(first.weight[:, pixels - 6 * FACTOR : pixels], 6, _MOTION)
-        _fade(first.weight[:, pixels:], 2, _PIXELS)
+        yield first.weight[:, pixels - 6 * FACTOR : pixels], 6
+        if tracker.config.use_uv:
+            yield first.weight[:, pixels:], 2
 
 
-def _fade(weight: Tensor, axes: int, degree: int) -> None:
-    """Let columns for `fourier` of so many axes fade above a degree; their mean square stays."""
-    if weight.shape[1]:
-        waves = torch.tensor([2.0 ** min(0, degree - j) for j in DEGREES]).repeat_interleave(axes)
-        factors = torch.cat([torch.ones(axes), waves, waves]).to(weight)
-        weight *= factors / factors.square().mean().sqrt()
+def by_degree(values: Sequence[float], axes: int, plain: float = 1.0) -> Tensor:
+    """A number for each of the outputs of `fourier` of so many axes, from one for each degree; `plain`: of the inputs."""
+    waves = torch.tensor(values).repeat_interleave(axes)
+    return torch.cat([torch.full((axes,), plain, dtype=waves.dtype), waves, waves])
 
 
 def _compare(block: Block, looks: int) -> None:
     """Attention that compares the first channels, `looks`, and takes the others; all for both where there are no others."""
     attention, width = block.attention, block.attention.to_q.in_features
-    inner = attention.to_q.out_features
-    size, split = inner // attention.heads, looks if width > looks else 0
+    size, split = attention.to_q.out_features // attention.heads, looks if width > looks else 0
     look = torch.eye(size, width)
     place = torch.roll(torch.eye(size, width), split, 1)
     if split:
