@@ -7,7 +7,7 @@
     updater's blocks                   = identities            zero output projections
 
 The paper does not say how its weights start. Only the start changes: every weight is trained, and the tracker is the
-same. From random weights a small tracker does not use colour within its first thousands of steps.
+same. From random weights a small tracker can leave colour unused for long.
 """
 
 from __future__ import annotations
