@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NoReturn
 
 import tyro
 from tqdm import tqdm
@@ -243,13 +243,15 @@ def lab(
     against: Annotated[str | None, arg(help="the row that others are compared with")] = None,
     metric: Annotated[tuple[str, ...], arg(help="that judge, the first one first")] = JUDGED,
     out: Annotated[Path, arg(help="folder (report)")] = Path("report"),
-    budget: Annotated[str | None, arg(help="in place of the study's own: lab, tiny (seconds a row) or shipped")] = None,
+    budget: Annotated[
+        str | None, arg(help="in place of the study's own: lab, gpu, tiny (seconds a row) or shipped")
+    ] = None,
     seeds: Annotated[int | None, arg(help="trainings of each row, in place of the study's own number")] = None,
     accept_code: Annotated[bool, arg(help="go on with results of other code")] = False,
     allow: Annotated[tuple[str, ...], ALLOW] = (),
 ) -> None:
     """Run a study of rows under equal conditions; its table, its report, its rows, or the paper's tables by name."""
-    from tapip3d_lite.lab.papers import TABLES, listed, open_study, report_all
+    from tapip3d_lite.lab.papers import TABLES, listed, open_study, report_all, run_all
 
     if study is None:
         print("\n".join(f"{name}: {' · '.join(values['rows'])}" for name, values in TABLES.items()))
@@ -257,14 +259,22 @@ def lab(
     if (action, study) == ("report", "paper"):
         print(f"wrote {report_all(out)}")
         return
+    if (action, study) == ("run", "paper"):
+        if not run_all(jobs, device, accept_code, budget, seeds):
+            _stopped()
+        return
     opened, base = open_study(study, accept_code, allow, budget, seeds, shipped=action != "run")
     if action == "run" and not opened.run(jobs, device):
-        print("stopped and saved; the same command goes on")
-        sys.exit(130)
+        _stopped()
     if action == "report":
         print(f"wrote {opened.report(out, against or base)}")
     else:
         print(listed(opened) if action == "list" else opened.table(against or base, metric))
+
+
+def _stopped() -> NoReturn:
+    print("stopped and saved; the same command goes on")
+    sys.exit(130)
 
 
 def import_(checkpoint: Positional[Path], out: Positional[Path], /) -> None:

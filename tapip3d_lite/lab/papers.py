@@ -10,7 +10,7 @@ from typing import Any
 from tapip3d_lite.evaluation.evaluate import markdown_table
 from tapip3d_lite.files import read_json, write_text
 from tapip3d_lite.lab.claims import CLAIM_HEAD, claim_cells
-from tapip3d_lite.lab.study import Study
+from tapip3d_lite.lab.study import Study, run_together
 from tapip3d_lite.lab.variant import Variant
 from tapip3d_lite.validate import check_names
 
@@ -195,6 +195,14 @@ def open_study(
     study = Study(folder, rows, **kept, accept_code=accept_code, parts=parts)
     study.paper = paper
     return study, values.get("against")
+
+
+def run_all(
+    jobs: int, device: str, accept_code: bool = False, budget: str | None = None, seeds: int | None = None
+) -> bool:
+    """Run all tables of the paper, with `budget` in place of `"lab"`; as `Study.run`."""
+    budgets = {name: None if "budget" in table else budget for name, table in TABLES.items()}
+    return run_together([open_study(name, accept_code, (), budgets[name], seeds)[0] for name in TABLES], jobs, device)
 
 
 def report_all(folder: Path) -> Path:

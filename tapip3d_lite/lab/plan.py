@@ -8,7 +8,7 @@ store/trainings/s0-<key>/    of a recipe with seed 0; rows and studies with the 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -139,8 +139,8 @@ class Plan:
 
     def encoders(self, data: Data, device: str) -> list[Job]:
         """The encoders that are still to be trained."""
-        found = {job.folder: job for row in self.rows.values() if (job := self._encoder(row, data, device))}
-        return [job for folder, job in found.items() if not (folder / "weights.safetensors").exists()]
+        jobs = [job for row in self.rows.values() if (job := self._encoder(row, data, device))]
+        return [job for job in jobs if not (job.folder / "weights.safetensors").exists()]
 
     def _encoder(self, row: Variant, data: Data | None, device: str) -> Job | None:
         """The training of a row's encoder, which is every row's unless their sizes differ; None for a given tracker."""
@@ -154,18 +154,16 @@ class Plan:
         return Job("the encoder", folder, recipe, None, (), data, self.budget, device)
 
     def trainings(self, data: Data, device: str) -> list[Job]:
-        """All that is still to be trained and scored, seed by seed; rows of one recipe share a job."""
-        found: dict[Any, Job] = {}
+        """All that is still to be trained and scored, seed by seed, a job for each row; see `shared`."""
+        jobs = []
         for seed in range(self.seeds):
             for row in self.rows.values() if seed == 0 else [row for row in self.rows.values() if row.given is None]:
-                job = self._training(row, seed, data, device)
+                job, file = self._training(row, seed, data, device), self.result(row, seed)
                 key = self._key(row, job)
                 facts = {"key": key, "code": digest(json.dumps(self.code)), "training": job.folder and job.folder.name}
-                if is_scored(self.result(row, seed), key):
-                    continue
-                job = found.get(job.folder or row.name, job)
-                found[job.folder or row.name] = replace(job, rows=(*job.rows, (row, self.result(row, seed), facts)))
-        return list(found.values())
+                if not is_scored(file, key):
+                    jobs.append(replace(job, rows=((row, file, facts),)))
+        return jobs
 
     def _training(self, row: Variant, seed: int, data: Data | None = None, device: str = "cpu") -> Job:
         """The training of a row with a seed, without what is scored by it."""
@@ -195,6 +193,20 @@ class Plan:
             ours = {s: self.settled or x["key"] == self._key(row, self._training(row, s)) for s, x in held.items()}
             found[name] = {s: x for s, x in held.items() if ours[s]}
         return found
+
+
+def shared(jobs: Iterable[Job]) -> list[Job]:
+    """Jobs with those of one training made into one, and no two of one name."""
+    found: dict[Path | int, Job] = {}
+    for i, job in enumerate(jobs):
+        first = found.setdefault(job.folder or i, job)
+        if first is not job:
+            found[job.folder] = replace(first, rows=first.rows + job.rows)
+    names = [job.name for job in found.values()]
+    return [
+        job if names.count(job.name) == 1 else replace(job, name=f"{job.name} #{i}")
+        for i, job in enumerate(found.values(), 1)
+    ]
 
 
 def is_scored(file: Path, key: str) -> bool:

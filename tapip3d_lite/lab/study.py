@@ -25,7 +25,7 @@ from tapip3d_lite.lab.budgets import BUDGETS, Budget, judged_clip
 from tapip3d_lite.lab.claims import with_claims
 from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.lab.jobs import STOPPED, Job, do_all, tracker_of
-from tapip3d_lite.lab.plan import Plan, is_scored
+from tapip3d_lite.lab.plan import Plan, is_scored, shared
 from tapip3d_lite.lab.report import explorer, write_report
 from tapip3d_lite.lab.table import JUDGED, Table, compare, gaps_by_clip
 from tapip3d_lite.lab.train import interruptible
@@ -122,24 +122,7 @@ class Study:
         Raises:
             ValueError: clips that are too few or have changed, a full disk.
         """
-        if jobs < 1:
-            raise ValueError(f"Study.run: expected at least one job, got {jobs}")
-        plan = self.plan
-        data = plan.find_clips(jobs, progress)
-        with interruptible() as interrupted:
-            work = partial(_work, jobs, lambda: stop() or interrupted(), progress)
-            failed = work(plan.encoders(data, device))
-            if failed is None:
-                return False
-            if failed:
-                raise ValueError(f"Study: the encoder could not be trained: {'; '.join(failed.values())}")
-            todo = plan.trainings(data, device)
-            failed = work(todo)
-        for job in (job for job in todo if failed and job.name in failed):
-            for row, file, facts in (one for one in job.rows if not is_scored(one[1], one[2]["key"])):
-                values = {**facts, "row": row.name, "failed": failed[job.name]}
-                write_text(file, json.dumps(values, indent=1) + "\n")
-        return failed is not None
+        return run_together([self], jobs, device, stop, progress)
 
     def results(self) -> dict[str, dict[int, dict[str, Any]]]:
         """What the files of results hold, by row and seed; a tracker that is not trained has the seed 0 alone."""
@@ -202,6 +185,36 @@ class Study:
         """A widget: choose two rows, a seed and how far down the list of clips to go; it shows what `draw` draws."""
         clips = max(len(x.get("scores", ())) for seeds in self.results().values() for x in seeds.values())
         return explorer(list(self.plan.rows), self.plan.seeds, clips, self.draw)
+
+
+def run_together(
+    studies: Sequence[Study],
+    jobs: int = 1,
+    device: str = "cpu",
+    stop: Callable[[], bool] = lambda: False,
+    progress: bool = True,
+) -> bool:
+    """`Study.run` for several studies under one bar: what they share is trained once, and none waits for another's end.
+
+    Those that share a store must have one budget.
+    """
+    if jobs < 1:
+        raise ValueError(f"Study.run: expected at least one job, got {jobs}")
+    plans = [(study.plan, study.plan.find_clips(jobs, progress)) for study in studies]
+    with interruptible() as interrupted:
+        work = partial(_work, jobs, lambda: stop() or interrupted(), progress)
+        failed = work(shared(job for plan, data in plans for job in plan.encoders(data, device)))
+        if failed is None:
+            return False
+        if failed:
+            raise ValueError(f"Study: the encoder could not be trained: {'; '.join(failed.values())}")
+        todo = shared(job for plan, data in plans for job in plan.trainings(data, device))
+        failed = work(todo)
+    for job in (job for job in todo if failed and job.name in failed):
+        for row, file, facts in (one for one in job.rows if not is_scored(one[1], one[2]["key"])):
+            values = {**facts, "row": row.name, "failed": failed[job.name]}
+            write_text(file, json.dumps(values, indent=1) + "\n")
+    return failed is not None
 
 
 def _chosen(budget: str | Budget | None, old: dict[str, Any] | None, parts: Sequence[Any]) -> Budget:
