@@ -12,7 +12,7 @@ import tapip3d_lite as t3d
 from tapip3d_lite.training import schedule as clock
 from tapip3d_lite.training.data import make_batch
 from tapip3d_lite.training.loss import LossConfig, accuracy, step_accuracy
-from tapip3d_lite.training.optimizers import hidden_matrices, make_optimizer
+from tapip3d_lite.training.optimizers import Muon, hidden_matrices, make_optimizer
 from tapip3d_lite.training.parallel import Group
 from tapip3d_lite.training.pretrain import MatchingConfig
 from tapip3d_lite.training.recipe import TrainConfig
@@ -288,6 +288,21 @@ def test_muon_takes_the_matrices_inside_blocks_and_steps_as_far_as_adamw():
     pair.zero_grad()
     assert all(p.grad is None for p in tracker.parameters())
     assert isinstance(make_optimizer(nn.Linear(2, 2), [], "muon", 1e-2, 0.0, False), torch.optim.AdamW)
+
+
+def test_muon_of_stacked_matrices_is_torchs_to_the_bit():
+    sizes, pairs = [(6, 6), (4, 8), (6, 6), (8, 4), (4, 8)], []
+    for kind in (torch.optim.Muon, Muon):
+        torch.manual_seed(0)
+        weights = [nn.Parameter(torch.randn(size)) for size in sizes]
+        optimizer = kind(weights, 1e-2, 0.1, adjust_lr_fn="match_rms_adamw")
+        for _ in range(3):
+            for weight in weights[:-1]:  # one has no gradient
+                weight.grad = torch.randn(weight.shape)
+            optimizer.step()
+        pairs.append((weights, [state["momentum_buffer"] for state in optimizer.state.values() if state]))
+    for theirs, ours in zip(*pairs, strict=True):
+        assert len(theirs) == len(ours) and all(map(torch.equal, theirs, ours))
 
 
 def test_a_training_with_muon_continues_exactly(tmp_path, clips, one_thread):

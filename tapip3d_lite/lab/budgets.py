@@ -103,7 +103,9 @@ _TINY_STEPS = {
 }  # fmt: skip
 BUDGETS = {
     "lab": Budget(TrainConfig(tracker=_LAB, **_LAB_STEPS, **_FOCUSED), held_out=80),
-    "gpu": Budget(TrainConfig(tracker=_LAB, **{**_LAB_STEPS, "steps": 3000, "batch": 8}, **_FOCUSED), held_out=80),
+    "gpu": Budget(
+        TrainConfig(tracker=_LAB, **{**_LAB_STEPS, "batch": 8, "evaluate_every": 500}, **_FOCUSED), held_out=80
+    ),
     "tiny": Budget(TrainConfig(tracker=_TINY, **_TINY_STEPS, **_FOCUSED), tiny_scene, held_out=4, frames=6, points=12),
     # For rows that are not trained.
     "shipped": Budget(TrainConfig(clips=1, validation=0), shipped_scene, held_out=24, frames=16),

@@ -194,8 +194,7 @@ class Trainer:
         """The average forgets what is older than a tenth of the steps done, or than `config.average` steps."""
         if self.average is not self.tracker:
             share = max(1 / self.config.average, 10 / (self.step + 9))  # 1 in the first step
-            for mean, new in zip(self.average.parameters(), self.tracker.parameters(), strict=True):
-                mean.lerp_(new, share)
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.tracker.parameters()), share)
 
     def _match(self, pairs: list[FramePair]) -> dict:
         self._drawn = {"rgb": [pair.rgb for pair in pairs], "uv": [pair.uv for pair in pairs]}

@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from tapip3d_lite.geometry import pixel_grid, project, unproject
-from tapip3d_lite.model.cloud import quantile_roi
 from tapip3d_lite.model.neighbors import knn
 from tapip3d_lite.model.spaces import Space
 
@@ -62,8 +61,7 @@ class UVD(UVLogD):
 
     def fit(self, depths: Tensor, extrinsics: Tensor) -> UVD:
         """Near and far of each clip's first frame, outliers (sky) left out; later frames are not known to a stream."""
-        ranges = [_depth_range(depth) for depth in depths]
-        near, far = (torch.tensor(x, dtype=depths.dtype, device=depths.device) for x in zip(*ranges, strict=True))
+        near, far = _depth_ranges(depths.flatten(1))
         return UVD(near, depths.shape[-1] / (far - near))
 
     def _encode(self, z: Tensor, intrinsics: Tensor) -> Tensor:
@@ -82,8 +80,7 @@ class UV(UVLogD):
     def to_world(self, coords: Tensor, intrinsics: Tensor, extrinsics: Tensor, depths: Tensor) -> Tensor:
         """Pixels lifted by the depth of the nearest pixel that has one (interpolation would mix surfaces)."""
         uv = coords[..., :2]
-        maps = zip(depths.reshape(-1, *depths.shape[-2:]), uv.reshape(-1, *uv.shape[-2:]), strict=True)
-        z = torch.stack([_nearest_depth(*frame) for frame in maps])
+        z = _nearest_depth(depths.reshape(-1, *depths.shape[-2:]), uv.reshape(-1, *uv.shape[-2:]))
         return unproject(uv, z.reshape(uv.shape[:-1]), intrinsics, extrinsics)
 
     def _encode(self, z: Tensor, intrinsics: Tensor) -> Tensor:
@@ -99,21 +96,31 @@ def _per_clip(value: Tensor, like: Tensor) -> Tensor:
     return value.to(like).reshape(*value.shape, *[1] * (like.ndim - value.ndim))
 
 
-def _depth_range(depth: Tensor) -> tuple[float, float]:
-    valid = depth[depth > 0]
-    if not len(valid):
-        return 0.0, 1.0
-    near, far = float(valid.min()), float(valid[valid <= quantile_roi(valid)[1]].max())
-    return near, max(far, near * 1.01)
+def _depth_ranges(depths: Tensor) -> tuple[Tensor, Tensor]:
+    """Nearest and farthest depth (B,) of each row (B, P), outliers (`quantile_roi`) left out; 0 and 1 without depth."""
+    valid = depths > 0
+    ordered, count = torch.where(valid, depths, torch.inf).double().sort(1).values, valid.sum(1, keepdim=True)
+    low, high = (ordered.gather(1, ((share * count).long() - 1).clamp(min=0)) for share in (0.25, 0.75))
+    inside = ordered.float() <= (high + 1.5 * (high - low)).float()
+    near, far = ordered[:, 0], ordered.masked_fill(~inside, 0).amax(1)
+    near, far = torch.where(valid.any(1), near, 0), torch.where(valid.any(1), far.maximum(near * 1.01), 1)
+    return near.to(depths), far.to(depths)
 
 
-def _nearest_depth(depth: Tensor, uv: Tensor) -> Tensor:
-    """Depth (N,) of a map (H, W) at the pixels nearest to uv (N, 2); holes take the nearest valid pixel's, if any."""
-    last = torch.tensor([depth.shape[1] - 1, depth.shape[0] - 1], dtype=uv.dtype, device=uv.device)
-    column, row = uv.detach().nan_to_num().round().clamp(min=torch.zeros_like(last), max=last).long().unbind(-1)
-    z, hole, valid = depth[row, column], depth[row, column] <= 0, (depth > 0).nonzero()
-    if len(valid) and bool(hole.any()):
-        here, there = (F.pad(x.float(), (0, 1)) for x in (torch.stack([row, column], -1)[hole], valid))
-        near = valid[knn(here[None], there[None], 1)[0, :, 0]]
-        z = z.masked_scatter(hole, depth[near[:, 0], near[:, 1]])
-    return z
+def _nearest_depth(depths: Tensor, uv: Tensor) -> Tensor:
+    """Depths (F, N) of maps (F, H, W) at the pixels nearest to uv (F, N, 2); holes take the nearest valid pixel's, if any."""
+    frames, height, width = depths.shape
+    column, row = uv.detach().nan_to_num().round().unbind(-1)
+    place = torch.stack([row.clamp(0, height - 1), column.clamp(0, width - 1)], -1)  # (F, N, 2)
+    flat = depths.flatten(1)
+    z = flat.gather(1, (place[..., 0] * width + place[..., 1]).long())
+    if may_wait(depths) and bool((z > 0).all()):
+        return z
+    pixels = F.pad(pixel_grid(height, width, depths).flip(-1).flatten(0, 1), (0, 1)).expand(frames, -1, 3)
+    near = knn(F.pad(place, (0, 1)), pixels, 1, flat > 0)[..., 0]
+    return torch.where(z > 0, z, flat.gather(1, near))
+
+
+def may_wait(x: Tensor) -> bool:
+    """Whether a number can be looked at to save work; a GPU's graph (`speed.cuda_graph`) can hold no such look."""
+    return not x.is_cuda

@@ -37,7 +37,7 @@ class PlaneNeighborhood(nn.Module):
         sides, depths = level.extra  # (B*S, n, n, C) each: (x, z) and (y, z)
         last = sides.shape[1] - 1
         place = (coords.nan_to_num().clamp(-10, 10) / (2 * EXTENT) + 0.5) * last  # (B, S, N, 3) in cells of the planes
-        at = [cells, place[..., [0, 2]], place[..., [1, 2]]]
+        at = [cells, place[..., ::2], place[..., 1:]]
         steps, parts = window_steps(self.count, cells), []
         for grid, where in zip((level.features.flatten(0, 1), sides, depths), at, strict=True):
             around = (where.nan_to_num().unsqueeze(-2) + steps).flatten(0, 1)
@@ -81,7 +81,8 @@ def splat(features: Tensor, points: Tensor, valid: Tensor, axes: tuple[int, int]
     It is 0 where nothing does. Normalised points (F, P, 3) count where they are valid (F, P); two of their coordinates,
     `axes`, give column and row; n is `side`.
     """
-    place = ((points[..., list(axes)].detach() / (2 * EXTENT) + 0.5) * (side - 1)).round()
+    at = torch.stack([points[..., axis] for axis in axes], -1).detach()  # a list as index would be copied to the GPU
+    place = ((at / (2 * EXTENT) + 0.5) * (side - 1)).round()
     inside = valid & ((place >= 0) & (place <= side - 1)).all(-1)
     index = torch.where(inside, place[..., 1] * side + place[..., 0], 0).long()
     weight = inside.to(features.dtype).unsqueeze(-1)
