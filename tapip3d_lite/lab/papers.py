@@ -172,9 +172,9 @@ def open_study(
     if path.suffix not in (".toml", ".json"):
         check_names("lab: no file (.toml, .json), no study's folder, no table of the paper", [str(source)], TABLES)
         values, home = {"store": "runs/store", **TABLES[str(source)]}, Path()
-        paper = values.pop("paper", None)
-        if shipped and not (Path("runs") / path / "study.json").exists() and (PAPER / path / "study.json").exists():
-            study = Study(PAPER / path, store=PAPER / "store", accept_code=True)
+        paper, label = values.pop("paper", None), str(source) if budget is None else f"{source}, {budget}"
+        if shipped and not (Path("runs") / label / "study.json").exists() and (PAPER / label / "study.json").exists():
+            study = Study(PAPER / label, store=PAPER / "store", accept_code=True)
             study.paper, study.plan.settled = paper, True
             return study, values["against"]
     else:
@@ -207,18 +207,23 @@ def run_all(
 
 def report_all(folder: Path) -> Path:
     """Write the reports of all tables of the paper that have results, and a page of what became of its claims."""
-    rows, left = [], []
-    for name in TABLES:
-        study, against = open_study(name, accept_code=True, shipped=True)
-        if not any("scores" in one for seeds in study.results().values() for one in seeds.values()):
-            left.append(name)
+    rows, done, left = [], [], []
+    for name, budget in ((name, budget) for name, table in TABLES.items() for budget in (None, "gpu")):
+        if budget is not None and not any(
+            (place / f"{name}, gpu" / "study.json").exists() for place in (PAPER, Path("runs"))
+        ):
             continue
-        study.report(folder / name, against)
-        rows += [[f"[{name}]({name}/report.md)", *cells] for cells in claim_cells(study.table(against).claims)]
-    if len(left) == len(TABLES):
+        study, against = open_study(name, accept_code=True, budget=budget, shipped=True)
+        label = study.plan.folder.name
+        if not any("scores" in one for seeds in study.results().values() for one in seeds.values()):
+            left.append(label)
+            continue
+        done.append(f"[{label}](<{label}/report.md>)")
+        study.report(folder / label, against)
+        rows += [[done[-1], *cells] for cells in claim_cells(study.table(against).claims)]
+    if not done:
         raise ValueError("lab: no table of the paper has results yet; run one, e.g. `lab run n2n`")
-    done = ", ".join(f"[{name}]({name}/report.md)" for name in TABLES if name not in left)
-    parts = ["# The paper's claims", markdown_table(["table", *CLAIM_HEAD], rows), f"All tables: {done}."]
+    parts = ["# The paper's claims", markdown_table(["table", *CLAIM_HEAD], rows), f"All tables: {', '.join(done)}."]
     parts += [f"Without results yet: {', '.join(left)}."] if left else []
     write_text(folder / "report.md", "\n\n".join(parts) + "\n")
     return folder / "report.md"

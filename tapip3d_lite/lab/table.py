@@ -161,6 +161,11 @@ def _notes(rows: Sequence[dict[str, Any]], results: Results, against: str) -> li
     codes = {x.get("code") for seeds in results.values() for x in seeds.values()}
     if len(codes) > 1:
         notes.append(f"The rows were made by {len(codes)} versions of the code.")
+    minutes = [row["steps"] * row["step_ms"] / 60_000 for row in rows if row["steps"]]
+    devices = {x["device"] for seeds in results.values() for x in seeds.values() if x.get("training") and "device" in x}
+    if minutes and devices:
+        where = " or ".join(sorted(devices)).replace("cpu", "one core").replace("cuda", "a shared GPU")
+        notes.append(f"A training took {min(minutes):.1f} to {max(minutes):.1f} minutes on {where}.")
     return [
         *notes,
         f"Differences to {against}, paired by seed and clip, with 95 % intervals over seeds and clips. A verdict counts "
