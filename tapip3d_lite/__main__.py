@@ -262,6 +262,7 @@ def lab(
     if (action, study) == ("run", "paper"):
         if not run_all(jobs, device, accept_code, budget, seeds):
             _stopped()
+        print("finished; `lab report paper` writes what the tables say")
         return
     opened, base = open_study(study, accept_code, allow, budget, seeds, shipped=action != "run")
     if action == "run" and not opened.run(jobs, device):

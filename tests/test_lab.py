@@ -533,7 +533,9 @@ def test_shipped_tables_are_read_where_none_was_run(home, tmp_path, monkeypatch,
     monkeypatch.chdir(home)
     mine = call(monkeypatch, capsys, "run", "n2n")
     pack_tables.main()
-    assert "blur: left out, no scores of klt" in capsys.readouterr().out
+    assert "blur: stays as it is shipped, if it is; no scores of klt" in capsys.readouterr().out
+    trained = open_study("n2n")[0].results()["n2n"][0]["training"]
+    assert [path.name for path in shipped.glob("store/trainings/*")] == [f"cpu-{trained}"]
     here.mkdir()
     monkeypatch.chdir(here)
     monkeypatch.setattr(plan, "source_code", dict)  # read by a later version of the code …
@@ -553,6 +555,32 @@ def test_shipped_tables_are_read_where_none_was_run(home, tmp_path, monkeypatch,
     assert "Without results yet: blur." in (here / "all/report.md").read_text()
     assert "minus klt" in (here / "all/n2n/report.md").read_text()
     assert before == {path: path.read_bytes() for path in shipped.rglob("*") if path.is_file()}
+
+
+def test_tables_run_together_and_train_once_what_they_share(store, tmp_path, monkeypatch, capsys):
+    (tmp_path / "runs").mkdir()
+    shutil.move(store, tmp_path / "runs/store")
+    monkeypatch.chdir(tmp_path)
+    rows = {"n2n": {}, "1 update": {"track": {"iterations": 1}}, "klt": {"tracker": "klt"}}
+    tables = {
+        name: {"rows": some, "against": "klt", "seeds": 1}
+        for name, some in (
+            ("K", rows),
+            ("blur", {"klt": rows["klt"], "same": {}, "bad": {"lr": 1e3, "clip_norm": 1e9}}),
+        )
+    }
+    monkeypatch.setattr(papers, "TABLES", tables)
+    done, do = [], jobs.do
+    monkeypatch.setattr(jobs, "do", lambda job, *rest: done.append(job.name) or do(job, *rest))
+    monkeypatch.setitem(lab.BUDGETS, "gpu", TINY)
+    assert "lab report paper" in call(monkeypatch, capsys, "run", "paper", "--budget", "gpu")
+    assert done == ["n2n s0", "klt #2", "klt #3", "bad s0"]
+    first, second = (open_study(name, budget="gpu")[0].results() for name in tables)
+    assert first["n2n"][0]["scores"] == second["same"][0]["scores"] != first["1 update"][0]["scores"]
+    assert second["bad"][0].get("failed", "").startswith("FloatingPointError")
+    call(monkeypatch, capsys, "report", "paper", "--out", "all")
+    text = (tmp_path / "all/report.md").read_text()
+    assert "[K, gpu](<K, gpu/report.md>), [blur, gpu]" in text and "Without results yet: K, blur." in text
 
 
 def scored(level, trained=True, seeds=3):
