@@ -58,12 +58,13 @@ def tables() -> list[str]:
     return [name for name in TABLES if (PAPER / name / "study.json").exists()]
 
 
-def shipped(name: str, scratch: Path = Path("../runs/store")) -> tuple[Study, str]:
+def shipped(name: str, budget: str | None = None, scratch: Path = Path("../runs/store")) -> tuple[Study, str]:
     """A table of the paper as the library brings it along, and the row that others are compared with.
 
-    Clips that are looked at are simulated in `scratch`. ValueError for an unknown name.
+    With a `budget` the one that was trained so; clips that are looked at are simulated in `scratch`. ValueError for an
+    unknown name.
     """
-    study, against = open_study(name, accept_code=True, shipped=True)
+    study, against = open_study(name, accept_code=True, budget=budget, shipped=True)
     study.plan.scratch = scratch
     return study, against
 

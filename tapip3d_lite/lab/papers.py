@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -223,7 +224,9 @@ def report_all(folder: Path) -> Path:
         rows += [[done[-1], *cells] for cells in claim_cells(study.table(against).claims)]
     if not done:
         raise ValueError("lab: no table of the paper has results yet; run one, e.g. `lab run n2n`")
-    parts = ["# The paper's claims", markdown_table(["table", *CLAIM_HEAD], rows), f"All tables: {', '.join(done)}."]
+    counts = ", ".join(f"{n} {verdict}" for verdict, n in Counter(row[-1] for row in rows).most_common())
+    parts = ["# The paper's claims", markdown_table(["table", *CLAIM_HEAD], rows)]
+    parts += [f"Of {len(rows)} differences: {counts or 'none'}. All tables: {', '.join(done)}."]
     parts += [f"Without results yet: {', '.join(left)}."] if left else []
     write_text(folder / "report.md", "\n\n".join(parts) + "\n")
     return folder / "report.md"
