@@ -137,6 +137,13 @@ def test_sizes():
     assert sum(map(lines, core)) <= 3_500
 
 
+def test_shipped_files_are_small():
+    weights = [path.stat().st_size for path in (PACKAGE / "lab/paper").rglob("*.safetensors")]
+    assert max(weights) < 2e6 and sum(weights) < 30e6
+    assert all(path.stat().st_size < 8e6 for path in PACKAGE.rglob("*.safetensors"))
+    assert all(path.stat().st_size < 2e6 for path in (ROOT / "data_samples").rglob("*"))
+
+
 def test_one_name_one_thing():
     modules = Counter(name.rpartition(".")[2] for name, path in MODULES.items() if name and path.stem != "__init__")
     assert not [name for name, count in modules.items() if count > 1]
