@@ -23,6 +23,7 @@ from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.lab.papers import TABLES, open_study
 from tapip3d_lite.lab.table import compare
 from tapip3d_lite.model.weights import load_weights
+from tapip3d_lite.simulate import simulate_clip
 from tapip3d_lite.training.data import FeatureCache
 from tapip3d_lite.training.examples import Examples
 from tapip3d_lite.training.loss import LossConfig
@@ -335,6 +336,16 @@ def test_rows_and_seeds_can_be_added_and_only_they_are_done(study, monkeypatch):
     more = lab.Study(study.plan.folder, [*ROWS, lab.Variant("static", tracker="static")])
     assert more.run(progress=False) and done == ["static"] and "static" in more.table().rows[-1]["row"]
     assert list(lab.Study(study.plan.folder).plan.rows) == [*(row.name for row in ROWS), "static"]
+
+
+def test_depth_from_two_cameras_and_from_few_pixels():
+    clip = simulate_clip(seed=3, frames=2, size=(96, 96), tracks=8, stereo_baseline=0.2)
+    two, few = under(clip, {"stereo": True}, 0), under(clip, {"sparse": 0.1}, 0)
+    away = [np.abs(seen.depths / clip.depths - 1)[clip.depths > 0] for seen in (two, few)]
+    assert 0 < np.median(away[0]) < 0.03 and 0.08 < np.mean(away[1] == 0) < 0.5 and np.median(away[1]) < 0.05
+    assert np.array_equal(few.depths, under(clip, {"sparse": 0.1}, 0).depths)
+    with pytest.raises(ValueError, match="has no right images"):
+        under(replace(clip, extras={}), {"stereo": True}, 0)
 
 
 def test_other_clips_are_refused(study, store, tmp_path):

@@ -29,13 +29,13 @@ def lab_scene(seed: int) -> SimulationConfig:
 
 
 def tiny_scene(seed: int) -> SimulationConfig:
-    """A third of a second in 32 x 32 pixels."""
-    return replace(lab_scene(seed), frames=8, size=(32, 32), tracks=48)
+    """A third of a second in 32 x 32 pixels, filmed by two cameras."""
+    return replace(lab_scene(seed), frames=8, size=(32, 32), tracks=48, stereo_baseline=0.2)
 
 
 def shipped_scene(seed: int) -> SimulationConfig:
-    """What `lite` is judged by without a training: 128 x 128 pixels, and a camera that moves."""
-    return SimulationConfig(frames=16, tracks=128, camera=("arc", "linear", "handheld")[seed % 3])
+    """What `lite` is judged by without a training: 128 x 128 pixels, a camera that moves, and a second one beside it."""
+    return SimulationConfig(frames=16, tracks=128, camera=("arc", "linear", "handheld")[seed % 3], stereo_baseline=0.2)
 
 
 @dataclass(frozen=True)

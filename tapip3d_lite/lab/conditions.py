@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from tapip3d_lite.clip import Clip
+from tapip3d_lite.depth import densify_depth, stereo_depth
 from tapip3d_lite.geometry import project
 from tapip3d_lite.parts import import_part
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade, wrong_poses
@@ -46,8 +47,22 @@ def silhouettes(clip: Clip, share: float, _seed: int) -> Clip:
     return replace(clip, queries=tracks.queries, tracks=tracks)
 
 
+def stereo(clip: Clip, _value: bool, _seed: int) -> Clip:
+    """Depth from the images of two cameras, of a clip that was simulated with a `stereo_baseline`."""
+    if "video_right" not in clip.extras:
+        raise ValueError(f"degrade: {clip.name} has no right images; simulate it with a stereo_baseline")
+    baseline = float(clip.extras["stereo_baseline"])
+    return replace(clip, depths=stereo_depth(clip.video, clip.extras["video_right"], clip.intrinsics, baseline))
+
+
+def sparse(clip: Clip, share: float, seed: int) -> Clip:
+    """Only this share of the pixels knows its depth; the others take the nearest one's, as in the paper."""
+    known = np.random.default_rng(seed).random(clip.depths.shape) < share
+    return replace(clip, depths=densify_depth(np.where(known, clip.depths, np.float32(0))))
+
+
 CONDITIONS: dict[str, Callable[[Clip, Any, int], Clip]] = {
-    "grey": grey, "frozen": frozen, "poses": poses, "silhouettes": silhouettes
+    "grey": grey, "frozen": frozen, "poses": poses, "silhouettes": silhouettes, "stereo": stereo, "sparse": sparse
 }  # fmt: skip
 """Beside them the fields of `SensorConfig`, e.g. `{"blur": 1.5}` or `{"grain": 0.003, "shadow": 2.0}`."""
 

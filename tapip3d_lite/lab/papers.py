@@ -135,7 +135,7 @@ TABLES: dict[str, dict[str, Any]] = {
             name: ({"degrade": flaws},) for name, flaws in {
                 "true": {}, "1 % noise": {"noise": 0.01}, "5 % noise": {"noise": 0.05}, "2 % flicker": {"flicker": 0.02},
                 "mixed at silhouettes": {"flying": 0.5, "shadow": 1.5}, "half missing": {"dropout": 0.5},
-                "sensor-like": _SENSOR["degrade"],
+                "sensor-like": _SENSOR["degrade"], "stereo": {"stereo": True}, "2 % of the pixels": {"sparse": 0.02},
             }.items()
         },
     ),
