@@ -199,7 +199,7 @@ def _is(kind: str, value: object) -> bool:
     kind = kind.partition("[")[0].rpartition(".")[2]
     if kind in ("int", "float"):
         number = isinstance(value, Integral if kind == "int" else Real) and not isinstance(value, _KINDS["bool"])
-        return number and abs(value) < 1e300
+        return number and abs(value if isinstance(value, Integral) else float(value)) < 1e300  # float32 has no 1e300
     if kind in ("Sequence", "Collection", "tuple"):
         return isinstance(value, Collection) and not isinstance(value, str)
     if kind in _KINDS:
