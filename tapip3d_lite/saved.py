@@ -96,10 +96,8 @@ class _Reader(Machine):
 
 
 def _tensor(storage: Tensor, offset: int, size: tuple[int, ...], stride: tuple[int, ...]) -> Tensor:
-    count, values = (
-        expected(Tensor, storage).numel(),
-        (offset, *expected(tuple, size)[:64], *expected(tuple, stride)[:64]),
-    )
+    count = expected(Tensor, storage).numel()
+    values = (offset, *expected(tuple, size)[:64], *expected(tuple, stride)[:64])
     if not all(type(x) is int and 0 <= x < 2**48 for x in values) or not len(size) == len(stride) <= 8:
         raise ValueError("a tensor of no shape")
     if math.prod(size) == 0:
