@@ -73,7 +73,7 @@ def require(path: str | Path, arrays: Mapping[str, np.ndarray], what: str, keys:
     if missing:
         raise ValueError(
             f"{path}: {what} needs the keys {', '.join(keys)}; {', '.join(missing)} missing, "
-            f"the file has {', '.join(sorted(arrays)) or 'none'}; {remedy}"
+            f"the file has {', '.join(sorted(map(str, arrays))) or 'none'}; {remedy}"
         )
 
 
