@@ -93,8 +93,10 @@ def benchmark_clips(split: str, count: int | None = None, progress: bool = True)
         ValueError: unknown split, bad count, or rendered clips that differ from the fingerprints.
     """
     check_request(split, count)
-    path = split_file(split)
-    cache, key = _cache(), _key(path)
+    path, cache = split_file(split), _cache()
+    # Cached clips depend on the rollouts, the renderer's source, and versions of its packages.
+    sources = sorted((Path(__file__).parents[1] / "simulate").glob("*.py"))
+    key = digest(*(file.read_bytes() for file in (path, *sources)), f"{version('mujoco')} {version('numpy')}")
     jobs = [
         (cache / f"{split}-{index:02d}-{key}.npz", f"{split}-{index:02d}", rollout, marks)
         for index, (rollout, marks) in enumerate(load_rollouts(path)[:count])
@@ -117,12 +119,6 @@ def _cache() -> Path:
     except (RuntimeError, OSError):  # no home, or one that cannot be written
         pass
     return Path(tempfile.gettempdir()) / "tapip3d_lite" / "benchmark"
-
-
-def _key(path: Path) -> str:
-    """A digest of everything that cached clips depend on: rollouts, the renderer's source, versions of its packages."""
-    sources = sorted((Path(__file__).parents[1] / "simulate").glob("*.py"))
-    return digest(*(file.read_bytes() for file in (path, *sources)), f"{version('mujoco')} {version('numpy')}")
 
 
 def _cached(job: Job) -> Clip | None:

@@ -56,13 +56,8 @@ def clip_arrays(path: str | Path, skip: Collection[str] = (), outline: Collectio
 
 
 def load_tracks(path: str | Path) -> Tracks:
-    """Read tracks from a result npz (`Tracks.save`, or the authors' result file).
-
-    Raises:
-        ValueError: as for `load_own_clip`.
-    """
-    arrays = load_npz(path)
-    needed = ("coords", "visibs", "query_points")
+    """Read tracks from a result npz (`Tracks.save`, or the authors' result file); errors as for `load_own_clip`."""
+    arrays, needed = load_npz(path), ("coords", "visibs", "query_points")
     require(path, arrays, "a result", needed, "save one with Tracks.save")
     return Tracks(*(arrays[key] for key in needed), arrays.get("visib_logits"), arrays.get("dynamic"))
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from tapip3d_lite.bundle import motion
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert
 from tapip3d_lite.poses import move
@@ -129,10 +130,7 @@ def pose_error(rng: np.random.Generator, frames: int, degrees: float, drift: flo
     wander = np.cumsum(drift * np.radians(degrees) * rng.normal(size=(frames, 6)), 0)
     axes = rng.normal(size=(frames, 3))
     turns = axes / np.linalg.norm(axes, axis=-1, keepdims=True) * np.radians(degrees) * rng.normal(size=(frames, 1))
-    error = np.repeat(np.eye(4)[None], frames, 0)
-    error[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in turns + wander[:, :3]]
-    error[:, :3, 3] = wander[:, 3:]
-    return error
+    return np.stack([motion(x) for x in np.concatenate([wander[:, 3:], turns + wander[:, :3]], 1)])
 
 
 def _widened(mask: np.ndarray, width: float) -> np.ndarray:
