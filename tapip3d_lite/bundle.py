@@ -75,15 +75,23 @@ class Views:
         here, x, guess = self.corners[a][seen], self.x[a][seen], guess[seen]
         if not len(here):
             return Pair(a, b, x, np.zeros((0, 2)), np.zeros(0))
-        options = {"winSize": (side, side), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-        options["criteria"] = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)
-        there, out, _ = cv2.calcOpticalFlowPyrLK(self.gray[a], self.gray[b], here, guess.copy(), **options)
-        # The way back begins as far from its target as the way there did, else it would return trivially.
-        back, home, _ = cv2.calcOpticalFlowPyrLK(self.gray[b], self.gray[a], there, here + (there - guess), **options)
+        options = {"maxLevel": 3, "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)}
+        images = self.gray[a], self.gray[b]
+        there, returned = there_and_back(*images, here, guess, 0.5 * self.pixel, winSize=(side, side), **options)
         inverse = cv2.remap(self.inverse[b], there[:, None], None, cv2.INTER_LINEAR, borderValue=np.nan)[:, 0]
-        kept = (out & home)[:, 0].astype(bool) & (np.linalg.norm(back - here, axis=-1) < 0.5 * self.pixel)
-        kept &= np.isfinite(inverse)
+        kept = returned & np.isfinite(inverse)
         return Pair(a, b, x[kept], there[kept] / self.pixel, 1 / inverse[kept].astype(np.float64))
+
+
+def there_and_back(
+    one: np.ndarray, two: np.ndarray, here: np.ndarray, guess: np.ndarray, tolerance: float, **options: object
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) of a grey image found in another near a guess by Lucas-Kanade, and whether (n,) the way back returns."""
+    options["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
+    there, out, _ = cv2.calcOpticalFlowPyrLK(one, two, here, guess.copy(), **options)
+    # The way back begins as far from its target as the way there did, else it would return trivially.
+    back, home, _ = cv2.calcOpticalFlowPyrLK(two, one, there, here + (there - guess), **options)
+    return there, (out & home)[:, 0].astype(bool) & (np.linalg.norm(back - here, axis=-1) <= tolerance)
 
 
 @dataclass(frozen=True)

@@ -111,9 +111,8 @@ def _normalised(clip: Clip) -> Iterator[Finding]:
         message = f"intrinsics look normalised: fx = {focal:.3g} for an image {width} pixels wide"
         remedy = "Multiply row 0 by W and row 1 by H, then subtract 0.5 from cx and cy."
         fix = partial(rescaled, scale=(width, height), shift=-0.5)
-        yield Finding(
-            "normalised_intrinsics", message, remedy, fix, "focal length in image widths", focal / width, focal
-        )
+        measure = "focal length in image widths", focal / width, focal
+        yield Finding("normalised_intrinsics", message, remedy, fix, *measure)
 
 
 def _bulging(clip: Clip) -> Iterator[Finding]:

@@ -177,13 +177,17 @@ def register_depth(
     known = depth > 0
     uv = pixel_grid(*depth.shape, like=np.zeros(0))[known]
     points = unproject(uv, depth[known].astype(np.float64), depth_intrinsics)
-    uv, z = project(transform(points, color_from_depth), intrinsics)
-    u, v = np.rint(uv).astype(int).T
-    order = np.argsort(-z)  # the nearest is written last
-    order = order[((z > 0) & (u >= 0) & (v >= 0) & (u < size[1]) & (v < size[0]))[order]]
-    registered = np.zeros(size, np.float32)
-    registered[v[order], u[order]] = z[order]
-    return registered
+    return splat(*project(transform(points, color_from_depth), intrinsics), size)
+
+
+def splat(uv: np.ndarray, z: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Depth (H, W) of points at pixels (n, 2) and z (n,), elsewhere 0; of several points in one pixel the nearest counts."""
+    uv, depth = np.rint(uv), np.zeros(size, np.float32)
+    inside = (z > 0) & ((uv >= 0) & (uv < size[::-1])).all(-1)
+    order = np.argsort(-z[inside])  # the nearest is written last
+    u, v = uv[inside][order].astype(int).T
+    depth[v, u] = z[inside][order]
+    return depth
 
 
 def _valid(depths: np.ndarray) -> np.ndarray:

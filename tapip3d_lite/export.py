@@ -45,10 +45,9 @@ def _csv(tracks: Tracks, path: Path, clip: Clip) -> None:
     t, n = np.divmod(np.arange(frames * count), count)
     uv, z = project(tracks.xyz, clip.intrinsics, clip.extrinsics)
     uv = np.where(z[..., None] > 0, uv, np.nan).reshape(-1, 2)
-    lines = io.StringIO("frame,track,x,y,z,visible,u,v\n")
-    lines.seek(0, io.SEEK_END)
+    lines, head = io.StringIO(), "frame,track,x,y,z,visible,u,v"
     rows = np.column_stack([t, n, tracks.xyz.reshape(-1, 3), tracks.visible.ravel(), uv])
-    np.savetxt(lines, rows, fmt="%d,%d,%.7g,%.7g,%.7g,%d,%.3f,%.3f")
+    np.savetxt(lines, rows, fmt="%d,%d,%.7g,%.7g,%.7g,%d,%.3f,%.3f", header=head, comments="")
     path.write_text(lines.getvalue().replace("nan", ""), encoding="utf-8")
 
 
@@ -64,7 +63,7 @@ def _ply(tracks: Tracks, path: Path, clip: Clip) -> None:
     vertices["frame"] = np.arange(frames)[:, None]
     index = np.arange(frames * count, dtype="<i4").reshape(frames, count)
     edges = np.stack([index[:-1], index[1:]], -1).reshape(-1, 2)
-    kinds = {"<f4": "float", "u1": "uchar", "<i4": "int", "|u1": "uchar"}
+    kinds = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {vertices.size}"]
     head += [f"property {kinds[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names]
     head += [f"element edge {len(edges)}", "property int vertex1", "property int vertex2", "end_header\n"]
@@ -174,9 +173,8 @@ def serve_tracks(tracks: Tracks, clip: Clip, port: int = 8080) -> Any:
 
 def _seen_points(clip: Clip, t: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (P, 3) of a frame's known depths, and their colours (P, 3) uint8."""
-    depth = clip.depths[t]
-    known = np.isfinite(depth) & (depth > 0)
-    return point_map(depth, clip.intrinsics[t], clip.extrinsics[t])[known], clip.video[t][known]
+    known = clip.depths[t] > 0
+    return point_map(clip.depths[t], clip.intrinsics[t], clip.extrinsics[t])[known], clip.video[t][known]
 
 
 def _extra(module: str, package: str) -> Any:

@@ -67,9 +67,8 @@ def agreement(clip: Clip, starts: int = 4, count: int = 400, memory: dict | None
     pairs = [(t, t + gap) for gap in gaps for t in np.linspace(0, max(frames - gap - 1, 0), starts).astype(int)]
     pairs = [pair for pair in dict.fromkeys(pairs) if pair[1] < frames]
     near = [(t, t + 1) for t in np.unique(np.linspace(0, frames - 2, 6 * starts).astype(int)) if frames > 1]
-    known, image = (
-        memory.setdefault(id(x), ({}, x))[0] for x in (clip.depths, clip.video)
-    )  # x lives on: so does its id
+    # x lives on beside what is known of it: so does its id.
+    known, image = (memory.setdefault(id(x), ({}, x))[0] for x in (clip.depths, clip.video))
     for t in {t for pair in pairs + near for t in pair} - (set(known) & set(image)):
         inverse = smooth_inverse(clip.depths[t])
         known[t] = inverse, *np.nonzero(np.isfinite(inverse))
@@ -124,9 +123,8 @@ def _carry(
     here, there = np.column_stack([image[t][v, u], np.full(len(u), 255.0)])[inside], there[inside]
     change = there - here[:, :3]
     for _ in range(2):  # exposure and white balance differ: an affine function of colours, by what fits best
-        fits = (
-            change.min(-1) > -np.inf if len(here) < 20 else np.abs(change).sum(-1) <= np.median(np.abs(change).sum(-1))
-        )
+        size = np.abs(change).sum(-1)
+        fits = size <= (np.median(size) if len(size) >= 20 else np.inf)
         change = there - here @ np.linalg.lstsq(here[fits], there[fits], rcond=None)[0]
     other = np.resize(np.abs(there - np.roll(there, 1, 0)).mean(-1), len(u))
     colour = np.full(len(u), np.median(other))

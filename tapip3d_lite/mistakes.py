@@ -13,7 +13,8 @@ from functools import cached_property, partial
 import cv2
 import numpy as np
 
-from tapip3d_lite.clip import Clip
+from tapip3d_lite.clip import CLIP_KEYS, Clip
+from tapip3d_lite.depth import splat
 from tapip3d_lite.geometry import invert, point_map
 from tapip3d_lite.measures import agreement, edges, line, triangulated
 from tapip3d_lite.poses import estimate_poses
@@ -119,7 +120,7 @@ def shifted(clip: Clip, by: int, key: str) -> Clip:
     """What frame t + `by` holds of an array goes to frame t; frames for which there is nothing are cut off."""
     moved, rest = (slice(by, None), slice(None, -by)) if by > 0 else (slice(None, by), slice(-by, None))
     extras = {name: x[rest] if name.endswith("_right") else x for name, x in clip.extras.items()}
-    arrays = {name: getattr(clip, name)[rest] for name in ("video", "depths", "intrinsics", "extrinsics")}
+    arrays = {name: getattr(clip, name)[rest] for name in CLIP_KEYS}
     return rebuilt(clip, **(arrays | {key: getattr(clip, key)[moved]}), extras=extras)
 
 
@@ -239,15 +240,12 @@ def swapped_axes(clip: Clip) -> Clip:
 
 def _registered(clip: Clip, baseline: float) -> Clip:
     """Depth seen from a place `baseline` to the right, in the clip's units; what only that place sees is unknown."""
-    out = np.zeros_like(clip.depths)
-    for t, depth in enumerate(clip.depths):
+    out = []
+    for depth, k in zip(clip.depths, clip.intrinsics, strict=True):
         v, u = np.nonzero(depth)
         z = depth[v, u]
-        there = np.rint(u - baseline * clip.intrinsics[t, 0, 0] / z).astype(int)
-        order = np.argsort(-z)  # what is near comes last and stays
-        order = order[(there[order] >= 0) & (there[order] < depth.shape[1])]
-        out[t, v[order], there[order]] = z[order]
-    return rebuilt(clip, depths=out)
+        out.append(splat(np.stack([u - baseline * k[0, 0] / z, v], -1), z, clip.size))
+    return rebuilt(clip, depths=np.stack(out))
 
 
 def _beside(case: Case) -> Candidates:

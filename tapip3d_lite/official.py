@@ -193,11 +193,7 @@ def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The configuration, as plain dictionaries, and the parameters of a checkpoint {"cfg", "weight", …}.
-
-    Raises:
-        ValueError: not such a file, or a refused name in its pickle.
-    """
+    """The configuration, as plain dictionaries, and the parameters of a checkpoint {"cfg", "weight", …}; else ValueError."""
     content = read_saved(path)
     content = content if type(content) is dict else {type(content).__name__: content}
     missing = " and ".join(key for key in ("cfg", "weight") if key not in content)

@@ -103,8 +103,7 @@ def carry(tracks: Tracks, source: Clip, target: Clip) -> Tracks:
         lengths = f"{len(tracks.xyz)}, {len(source)} and {len(target)}"
         raise ValueError(f"carry: tracks, source and target must have the same frames, got {lengths}; cut all alike")
     change = invert(target.extrinsics.astype(np.float64)) @ source.extrinsics.astype(np.float64)
-    xyz = transform(tracks.xyz.astype(np.float64), change)
-    return replace(tracks, xyz=xyz, queries=_moved(tracks.queries, change))
+    return _carried(tracks, change)
 
 
 def move(clip: Clip, change: np.ndarray) -> Clip:
@@ -114,12 +113,11 @@ def move(clip: Clip, change: np.ndarray) -> Clip:
     """
     moved = replace(clip, extrinsics=clip.extrinsics.astype(np.float64) @ invert(change), queries=None, tracks=None)
     queries = None if clip.queries is None else _moved(clip.queries, change)
-    tracks = clip.tracks and replace(
-        clip.tracks,
-        xyz=transform(clip.tracks.xyz.astype(np.float64), change),
-        queries=_moved(clip.tracks.queries, change),
-    )
-    return replace(moved, queries=queries, tracks=tracks)
+    return replace(moved, queries=queries, tracks=clip.tracks and _carried(clip.tracks, change))
+
+
+def _carried(tracks: Tracks, change: np.ndarray) -> Tracks:
+    return replace(tracks, xyz=transform(tracks.xyz.astype(np.float64), change), queries=_moved(tracks.queries, change))
 
 
 def _moved(queries: np.ndarray, change: np.ndarray) -> np.ndarray:

@@ -36,12 +36,11 @@ def _with_depth(clip: Clip, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def queries_from_pixels(clip: Clip, pixels: np.ndarray, on_invalid: str = "raise") -> np.ndarray:
     """Lift pixel queries, rows (t, u, v), to world-space queries, float32 rows (t, x, y, z).
 
-    The depth is that of the nearest pixel; (0, 0) is the top-left pixel's centre.
-
-    Rows on invalid depth are named in a ValueError, or left out (`on_invalid="skip"`; `has_depth` says which those are).
+    The depth is that of the nearest pixel; (0, 0) is the top-left pixel's centre. With `on_invalid="skip"` rows on
+    invalid depth are left out (`has_depth` says which those are).
 
     Raises:
-        ValueError: wrong shape, frame or pixel outside the clip, or invalid depth there.
+        ValueError: wrong shape, frame or pixel outside the clip, or rows on invalid depth, which are named.
     """
     if on_invalid not in ("raise", "skip"):
         raise ValueError(f'on_invalid: expected "raise" or "skip", got {on_invalid!r}')

@@ -25,9 +25,7 @@ _MOST = 2**22  # bytes of a pickle; each makes at most some hundred in memory
 
 
 def read_saved(path: str | Path) -> Any:
-    """The content of a file that `torch.save` wrote: containers, numbers, text, tensors on the CPU, and `Record`s.
-
-    Sets are lists; types and functions are `Name`s.
+    """The content of a file that `torch.save` wrote: what `pickled.Machine` makes, and tensors on the CPU.
 
     Raises:
         ValueError: no such file, a damaged one, one that would import something else, a TorchScript program, a file of
@@ -37,7 +35,8 @@ def read_saved(path: str | Path) -> Any:
         raise ValueError(f"{path}: no such file; check the path")
     try:
         with open(path, "rb") as file:
-            return _Reader(Archive(file)).content()
+            reader = _Reader(Archive(file))
+            return reader.run(bytes(reader.archive.read(reader.folder + "data.pkl")))
     except Refused as error:
         raise ValueError(
             f"{path}: {error} is refused: a checkpoint needs no such thing, and it could run code on this machine"
@@ -70,9 +69,6 @@ class _Reader(Machine):
         if order in sizes and archive.read(order) != sys.byteorder.encode():
             raise ValueError("numbers in another byte order")
 
-    def content(self) -> Any:
-        return self.run(bytes(self.archive.read(self.folder + "data.pkl")))
-
     def made(self, kind: Name, arguments: tuple) -> Any:
         match tuple(kind):
             case "torch._utils", "_rebuild_parameter":
@@ -96,10 +92,8 @@ class _Reader(Machine):
 
 
 def _tensor(storage: Tensor, offset: int, size: tuple[int, ...], stride: tuple[int, ...]) -> Tensor:
-    count, values = (
-        expected(Tensor, storage).numel(),
-        (offset, *expected(tuple, size)[:64], *expected(tuple, stride)[:64]),
-    )
+    count = expected(Tensor, storage).numel()
+    values = (offset, *expected(tuple, size)[:64], *expected(tuple, stride)[:64])
     if not all(type(x) is int and 0 <= x < 2**48 for x in values) or not len(size) == len(stride) <= 8:
         raise ValueError("a tensor of no shape")
     if math.prod(size) == 0:

@@ -118,8 +118,7 @@ def known_depths(depths: np.ndarray) -> np.ndarray:
     A warning counts such marks: what lies beyond 1,000 times the lower decile of the depths, and infinity if frequent.
     ValueError where nothing is left of several frames.
     """
-    finite = np.isfinite(depths)
-    known = finite & (depths > 0)
+    known = np.isfinite(depths) & (depths > 0)
     if not known.any():
         if len(depths) == 1:  # one frame may be one of a stream
             return np.zeros_like(depths)
@@ -166,15 +165,8 @@ def check_range(config: object, low: float, high: float, *names: str) -> None:
             raise ValueError(f"{type(config).__name__}.{name}: expected {wanted}, got {value}")
 
 
-_KINDS = {
-    "bool": bool | np.bool_,
-    "type": type,
-    "str": str,
-    "None": type(None),
-    "Path": PathLike,
-    "slice": slice,
-    "Mapping": Mapping,
-}
+_KINDS = {"bool": bool | np.bool_, "type": type, "str": str, "None": type(None), "Path": PathLike}
+_KINDS |= {"slice": slice, "Mapping": Mapping}
 _OURS = {"Clip", "Tracks", "Tracker", "TrackerConfig", "SimulationConfig", "Figure"}  # other words fit anything
 
 
@@ -199,7 +191,7 @@ def _is(kind: str, value: object) -> bool:
     kind = kind.partition("[")[0].rpartition(".")[2]
     if kind in ("int", "float"):
         number = isinstance(value, Integral if kind == "int" else Real) and not isinstance(value, _KINDS["bool"])
-        return number and abs(value) < 1e300
+        return number and abs(value if isinstance(value, Integral) else float(value)) < 1e300  # float32 has no 1e300
     if kind in ("Sequence", "Collection", "tuple"):
         return isinstance(value, Collection) and not isinstance(value, str)
     if kind in _KINDS:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import tapip3d_lite as t3d
+from tapip3d_lite.depth import splat
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade
 
 K = np.array([[100, 0, 63.5], [0, 100, 47.5], [0, 0, 1]])
@@ -77,6 +78,12 @@ def test_stereo_refuses_what_is_no_rectified_pair(change, message):
     given = {"left": left, "right": right, "intrinsics": K, "baseline": 0.3}
     with pytest.raises(ValueError, match=message):
         t3d.stereo_depth(**(given | change(left, right)))
+
+
+def test_of_several_points_in_a_pixel_the_nearest_counts():
+    uv = np.array([[3, 2], [3.4, 2.4], [3, 2], [5, 2], [-0.6, 2], [6.6, 2], [0, 4.6], [1, 1], [np.nan, 1]])
+    depth = splat(uv, np.array([3, 2, 4, 5, 1, 1, 1, -1, 1.0]), (5, 7))
+    assert depth.dtype == np.float32 and depth[2, 3] == 2 and depth[2, 5] == 5 and (depth > 0).sum() == 2
 
 
 def test_sparse_depth_takes_the_nearest():

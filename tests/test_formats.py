@@ -15,7 +15,6 @@ import tapip3d_lite as t3d
 from tapip3d_lite.depth import register_depth
 from tapip3d_lite.files import load_objects
 from tapip3d_lite.formats import FORMATS
-from tapip3d_lite.formats.arrays import _sparse
 from tapip3d_lite.formats.images import read_depth
 from tapip3d_lite.geometry import invert, point_map, project, resize_intrinsics, transform
 
@@ -303,13 +302,6 @@ def test_tapvid3d_without_poses_and_with_sparse_depth(clip, tmp_path):
     still = t3d.load_clip(path, depth="sparse")
     assert (still.extrinsics == np.eye(4)).all()
     np.testing.assert_allclose(still.tracks.xyz, arrays["tracks_XYZ"], atol=1e-6)
-
-
-def test_sparse_depth_is_that_of_the_nearest_point():
-    xyz = np.array([[[0, 0, 3.0], [0, 0, 2.0], [0, 0, 1.0], [0, 0, 4.0], [1, 0, 5.0]]])
-    k = np.array([[[10, 0, 3], [0, 10, 2], [0, 0, 1.0]]])
-    depth = _sparse(xyz, np.array([[True, True, False, True, True]]), k, (5, 7))
-    assert depth[0, 2, 3] == 2 and depth[0, 2, 5] == 5 and (depth > 0).sum() == 2
 
 
 def test_depth_anything_and_batches(clip, tmp_path):

@@ -332,6 +332,11 @@ def test_bad_settings_are_named(name, value):
         simulate_clip(0, **{name: value})
 
 
+def test_settings_may_be_numbers_of_numpy_and_lists():
+    config = SimulationConfig(fps=np.float32(10), frames=np.int64(4), size=[64, 48], sky=np.bool_(True))
+    assert config == SimulationConfig(fps=10.0, frames=4, size=(64, 48), sky=True)
+
+
 def test_unknown_setting_bad_seed_and_bad_counts(tmp_path):
     with pytest.raises(ValueError, match="unknown setting colour"):
         simulate_clip(0, colour=1)

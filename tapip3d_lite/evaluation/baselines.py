@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from tapip3d_lite.bundle import there_and_back
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.geometry import project, unproject
 from tapip3d_lite.queries import near_origin, resolve_queries, shifted
@@ -101,13 +102,15 @@ class KltTracker(Baseline):
     def _advance(self, paths: _Paths, t: int, last: np.ndarray, begun: np.ndarray) -> None:
         """Look in frame t for all points (N,) whose query frame lies behind, from where each was `last` seen."""
         camera = paths.clip.intrinsics[t], paths.clip.extrinsics[t]
+        options = {"winSize": (self.window, self.window), "maxLevel": self.levels}
         still, z = project(paths.world[last, np.arange(len(last))], *camera)
         surface, inside = _nearest_depth(paths.clip, t, still, z)
         # A lost point can reappear only where a surface has its depth; a point seen in the last frame may have moved.
         possible = begun & (z > 0) & ((last == t - 1) | (last == t + 1) | (inside & self._same(surface, z)))
         for origin in np.unique(last[possible]):
             which = np.flatnonzero(possible & (last == origin))
-            there, returned = self._flow(paths, origin, t, which, still[which])
+            here, guess = paths.uv[origin, which], still[which].astype(np.float32)
+            there, returned = there_and_back(paths.gray[origin], paths.gray[t], here, guess, self.tolerance, **options)
             depth, inside = _nearest_depth(paths.clip, t, there, z[which])
             kept = returned & inside & self._same(depth, z[which])
             if abs(origin - t) > 1:  # after a gap a large correction is more often another point than this one
@@ -115,17 +118,6 @@ class KltTracker(Baseline):
             found = which[kept]
             paths.uv[t, found], paths.seen[t, found], last[found] = there[kept], True, t
             paths.world[t, found] = unproject(there[kept], depth[kept], *camera)
-
-    def _flow(self, paths: _Paths, a: int, b: int, which: np.ndarray, guess: np.ndarray) -> tuple:
-        """Pixels (n, 2) in frame b of the points `which` of frame a, and whether (n,) the way back returns."""
-        size, flags = (self.window, self.window), cv2.OPTFLOW_USE_INITIAL_FLOW
-        options = {"winSize": size, "maxLevel": self.levels, "flags": flags}
-        here, guess = paths.uv[a, which], guess.astype(np.float32)
-        there, out, _ = cv2.calcOpticalFlowPyrLK(paths.gray[a], paths.gray[b], here, guess.copy(), **options)
-        # The backward search starts as far from its target as the forward search did, else it would return trivially.
-        back, home, _ = cv2.calcOpticalFlowPyrLK(paths.gray[b], paths.gray[a], there, here + (there - guess), **options)
-        returned = np.linalg.norm(back - here, axis=-1) <= self.tolerance
-        return there, out[:, 0].astype(bool) & home[:, 0].astype(bool) & returned
 
     def _same(self, depth: np.ndarray, expected: np.ndarray) -> np.ndarray:
         return np.abs(depth - expected) <= self.jump * expected

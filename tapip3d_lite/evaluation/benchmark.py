@@ -15,7 +15,7 @@ from tqdm import tqdm
 from tapip3d_lite.evaluation.baselines import TrackerLike
 from tapip3d_lite.evaluation.evaluate import evaluate, markdown_table
 from tapip3d_lite.evaluation.intervals import Estimate, bootstrap_interval, paired_difference
-from tapip3d_lite.evaluation.lite_splits import ALL, COUNT, SPLITS, benchmark_clips, check_split, split_file
+from tapip3d_lite.evaluation.lite_splits import ALL, COUNT, SPLITS, benchmark_clips, check_request, split_file
 from tapip3d_lite.files import digest, read_json, write_text
 from tapip3d_lite.measures import flawed_on_purpose
 from tapip3d_lite.parts import source
@@ -49,9 +49,7 @@ def run_benchmark(
         ValueError: unknown split, bad count, an unreadable file, or clips that differ from the benchmark's.
     """
     for split in splits:
-        check_split(split)
-    if count is not None and count < 1:
-        raise ValueError(f"run_benchmark: count must be at least 1, got {count}; leave it out for all clips")
+        check_request(split, count)
     results, versions = load_results(out) if out and Path(out).exists() else ({}, {})
     wanted = {}
     for label, tracker, options in list(runs):  # all are there, or refused, before the first one works
@@ -122,13 +120,11 @@ def summary_table(results: Results, metrics: Sequence[str] = METRICS, splits: Se
     return markdown_table(["split", "tracker", *metrics], rows)
 
 
-def difference_table(
-    results: Results, ours: str, theirs: str, metrics: Sequence[str] = METRICS, splits: Sequence[str] = ALL
-) -> str:
+def difference_table(results: Results, ours: str, theirs: str, metrics: Sequence[str] = METRICS) -> str:
     """A Markdown table of ours - theirs, paired by clip, with 95 % intervals; one row a split."""
     one, other = results.get(ours, {}), results.get(theirs, {})
     rows = []
-    for split in (split for split in splits if split in one and split in other):
+    for split in (split for split in ALL if split in one and split in other):
         common = sorted(one[split].keys() & other[split].keys())
         pairs = ([[scores[split][c].get(m, math.nan) for c in common] for scores in (one, other)] for m in metrics)
         rows.append([f"{split} ({len(common)})", *(show(paired_difference(*pair), "+") for pair in pairs)])

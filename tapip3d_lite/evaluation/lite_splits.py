@@ -36,10 +36,12 @@ Job = tuple[Path, str, Rollout, dict[str, np.ndarray]]  # file in the cache, nam
 SLACK = {"tracks": 2, "depths": 4, "visible": 0, "video": 4}  # millimetres, millimetres, bits, grey levels
 
 
-def check_split(split: str) -> None:
-    """Raise ValueError for a split that is none of `ALL`."""
+def check_request(split: str, count: int | None) -> None:
+    """Raise ValueError for a split that is none of `ALL`, or fewer of its clips than one."""
     if split not in ALL:
         raise ValueError(f"split: expected one of {', '.join(ALL)}, got {split!r}; choose one of them")
+    if count is not None and count < 1:
+        raise ValueError(f"count: expected at least 1, got {count}; leave it out for all clips")
 
 
 def split_file(split: str) -> Path:
@@ -90,11 +92,11 @@ def benchmark_clips(split: str, count: int | None = None, progress: bool = True)
     Raises:
         ValueError: unknown split, bad count, or rendered clips that differ from the fingerprints.
     """
-    check_split(split)
-    if count is not None and count < 1:
-        raise ValueError(f"benchmark_clips: count must be at least 1, got {count}; leave it out for all clips")
-    path = split_file(split)
-    cache, key = _cache(), _key(path)
+    check_request(split, count)
+    path, cache = split_file(split), _cache()
+    # Cached clips depend on the rollouts, the renderer's source, and versions of its packages.
+    sources = sorted((Path(__file__).parents[1] / "simulate").glob("*.py"))
+    key = digest(*(file.read_bytes() for file in (path, *sources)), f"{version('mujoco')} {version('numpy')}")
     jobs = [
         (cache / f"{split}-{index:02d}-{key}.npz", f"{split}-{index:02d}", rollout, marks)
         for index, (rollout, marks) in enumerate(load_rollouts(path)[:count])
@@ -117,12 +119,6 @@ def _cache() -> Path:
     except (RuntimeError, OSError):  # no home, or one that cannot be written
         pass
     return Path(tempfile.gettempdir()) / "tapip3d_lite" / "benchmark"
-
-
-def _key(path: Path) -> str:
-    """A digest of everything that cached clips depend on: rollouts, the renderer's source, versions of its packages."""
-    sources = sorted((Path(__file__).parents[1] / "simulate").glob("*.py"))
-    return digest(*(file.read_bytes() for file in (path, *sources)), f"{version('mujoco')} {version('numpy')}")
 
 
 def _cached(job: Job) -> Clip | None:

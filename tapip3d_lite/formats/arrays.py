@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from tapip3d_lite.clip import CLIP_KEYS, OWN_KEYS, Clip, Tracks
+from tapip3d_lite.depth import splat
 from tapip3d_lite.files import load_npz, map_npy
 from tapip3d_lite.formats.folders import matrix, numbered
 from tapip3d_lite.formats.images import DEPTHS, decode_color, fit_depth, read_depth
-from tapip3d_lite.geometry import in_image, invert, project, transform
+from tapip3d_lite.geometry import invert, project, transform
 
 _JPEG = "images_jpeg_bytes"
 
@@ -55,13 +56,8 @@ def clip_arrays(path: str | Path, skip: Collection[str] = (), outline: Collectio
 
 
 def load_tracks(path: str | Path) -> Tracks:
-    """Read tracks from a result npz (`Tracks.save`, or the authors' result file).
-
-    Raises:
-        ValueError: as for `load_own_clip`.
-    """
-    arrays = load_npz(path)
-    needed = ("coords", "visibs", "query_points")
+    """Read tracks from a result npz (`Tracks.save`, or the authors' result file); errors as for `load_own_clip`."""
+    arrays, needed = load_npz(path), ("coords", "visibs", "query_points")
     require(path, arrays, "a result", needed, "save one with Tracks.save")
     return Tracks(*(arrays[key] for key in needed), arrays.get("visib_logits"), arrays.get("dynamic"))
 
@@ -72,16 +68,15 @@ def require(path: str | Path, arrays: Mapping[str, np.ndarray], what: str, keys:
     if missing:
         raise ValueError(
             f"{path}: {what} needs the keys {', '.join(keys)}; {', '.join(missing)} missing, "
-            f"the file has {', '.join(sorted(arrays)) or 'none'}; {remedy}"
+            f"the file has {', '.join(sorted(map(str, arrays))) or 'none'}; {remedy}"
         )
 
 
 def result(path: Path, points: bool) -> Clip:
     """The authors' result: the clip in it with its queries (`load_tracks` reads the tracks)."""
     arrays = load_npz(path)
-    keys = ("video", "depths", "intrinsics", "extrinsics")
-    require(path, arrays, "a result with its clip", keys, "give `save` the clip")
-    video, *cameras = (arrays[key] for key in keys)
+    require(path, arrays, "a result with its clip", CLIP_KEYS, "give `save` the clip")
+    video, *cameras = (arrays[key] for key in CLIP_KEYS)
     return Clip(_video(video), *cameras, arrays.get("query_points") if points else None, name=path.stem)
 
 
@@ -118,11 +113,11 @@ def tapvid3d(path: Path, points: bool, depth: str | Path | None = None) -> Clip:
     video = np.stack([decode_color(bytes(image), f"{path}: image {t}") for t, image in enumerate(arrays[_JPEG])])
     xyz, visible = arrays["tracks_XYZ"].astype(np.float64), arrays["visibility"].astype(bool)
     intrinsics = np.tile(matrix(arrays["fx_fy_cx_cy"], f"{path}: fx_fy_cx_cy"), (len(video), 1, 1))
-    extrinsics = arrays.get("extrinsics_w2c", np.eye(4)).astype(np.float64)
-    extrinsics = np.broadcast_to(extrinsics, (len(video), 4, 4))
+    extrinsics = np.broadcast_to(arrays.get("extrinsics_w2c", np.eye(4)).astype(np.float64), (len(video), 4, 4))
     size = video.shape[1:3]
     if depth == "sparse":
-        depths = _sparse(xyz, visible, intrinsics, size)
+        each = zip(*project(xyz, intrinsics), visible, strict=True)
+        depths = np.stack([splat(uv[seen], z[seen], size) for uv, z, seen in each])
     else:
         depths = np.stack([fit_depth(image, size, depth) for image in read_depths(depth)])
     world = transform(xyz, invert(extrinsics))
@@ -130,19 +125,6 @@ def tapvid3d(path: Path, points: bool, depth: str | Path | None = None) -> Clip:
     queries = np.concatenate([times[:, None], world[times, np.arange(len(times))]], 1)
     tracks = Tracks(world, visible, queries) if points else None
     return Clip(video, depths, intrinsics, extrinsics, tracks=tracks, name=path.stem, fps=30.0)
-
-
-def _sparse(xyz: np.ndarray, visible: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Depth (T, H, W) at the pixels of the visible points (T, N, 3) in camera space, elsewhere 0; the nearest counts."""
-    depths = np.zeros((len(xyz), *size), np.float32)
-    uv, z = project(xyz, intrinsics)
-    shown = visible & in_image(xyz, intrinsics, np.eye(4), size)
-    t, n = np.nonzero(shown)
-    far_first = np.argsort(-z[t, n])
-    t, n = t[far_first], n[far_first]
-    u, v = np.clip(np.rint(uv[t, n]).astype(int), 0, (size[1] - 1, size[0] - 1)).T
-    depths[t, v, u] = z[t, n]
-    return depths
 
 
 def read_depths(path: str | Path) -> np.ndarray:

@@ -25,11 +25,7 @@ def decode_color(data: bytes, name: object) -> np.ndarray:
 
 
 def read_video(path: Path, frames: slice) -> tuple[np.ndarray, int, float]:
-    """The chosen frames (T, H, W, 3) uint8 RGB of a video, how many it has, and frames per second.
-
-    Raises:
-        ValueError: the file cannot be opened (an unknown codec), or holds no such frame.
-    """
+    """The chosen frames (T, H, W, 3) uint8 RGB of a video, how many it has, and frames per second; ValueError if none."""
     video, chosen, wanted, count = cv2.VideoCapture(str(path)), [], range(*frames.indices(1 << 40)), 0
     while video.grab():
         if count in wanted:

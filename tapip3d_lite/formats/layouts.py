@@ -10,6 +10,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Tracks
 from tapip3d_lite.files import load_objects, read_json
+from tapip3d_lite.formats.arrays import require
 from tapip3d_lite.formats.folders import Parts, Settings, numbered, read_poses, rigid, table
 from tapip3d_lite.formats.images import DEPTHS, PICTURES, VIDEOS, read_depth
 from tapip3d_lite.geometry import in_image
@@ -93,9 +94,7 @@ def record3d(folder: Path) -> Parts:
     """Record3D: `metadata` (K in columns, poses qx qy qz qw tx ty tz, ARKit's axes), `rgbd/`, or `rgb/` and `depth/`."""
     path = next(x for x in (folder / "metadata", folder / "metadata.json") if x.is_file())
     meta = read_json(path)
-    missing = [key for key in ("K", "poses", "w", "h") if key not in meta]
-    if missing:
-        raise ValueError(f"{path}: {', '.join(missing)} missing; export again, or force another format")
+    require(path, meta, "Record3D", ("K", "poses", "w", "h"), "export again, or force another format")
     one = folder / "rgbd"
     homes = (one, one) if one.is_dir() else (folder / "rgb", folder / "depth")
     color = numbered(homes[0], (".jpg", ".jpeg") if one.is_dir() else PICTURES)
@@ -136,10 +135,10 @@ def kubric(folder: Path) -> Parts:
     path = folder / f"{folder.resolve().name}.npy"
     with open(path, "rb") as file:
         truth = load_objects(path, file)
-    missing = [x for x in ("depth_range", "traj_3d", "occluded", "intrinsics", "matrix_world") if x not in truth]
-    if missing:
-        raise ValueError(f"{path}: {', '.join(missing)} missing; it has {', '.join(map(str, truth))}")
-    read = partial(_between, **dict(zip(("low", "high"), map(float, truth["depth_range"]), strict=True)))
+    keys = ("depth_range", "traj_3d", "occluded", "intrinsics", "matrix_world")
+    require(path, truth, "a training clip", keys, "take the complete file")
+    low, high = map(float, truth["depth_range"])
+    read = partial(_between, low=low, high=high)
     color, depth = (numbered(folder / "frames", (".png",), end) for end in (r"^\d+\.png$", r"^\d+_depth\.png$"))
     parts = _kubric(folder, color, depth, truth["matrix_world"], truth["intrinsics"], read)
     parts.tracks = partial(_kubric_tracks, truth)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from tapip3d_lite.bundle import motion
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.geometry import invert
 from tapip3d_lite.poses import move
@@ -82,9 +83,9 @@ def degrade(clip: Clip, config: SensorConfig, seed: int | np.random.Generator = 
     rng, unit = np.random.default_rng(seed), clip.size[1] / 128
     depths = clip.depths
     if config.flying or config.shadow:
-        near, far = _each(cv2.erode, depths), _each(cv2.dilate, depths)
+        square = np.ones((3, 3), np.uint8)
+        near, far = (np.stack([change(x, square) for x in depths]) for change in (cv2.erode, cv2.dilate))
         edge = (far - near) > _EDGE * np.maximum(near, 1e-3)  # silhouettes: two surfaces in a neighbourhood
-    away = _grazing(clip, config.grazing) if config.grazing else None
     shape = depths.shape
     if config.flying:
         mixed = near + rng.random(shape, np.float32) * (far - near)
@@ -98,8 +99,8 @@ def degrade(clip: Clip, config: SensorConfig, seed: int | np.random.Generator = 
     lost = rng.random(shape) < config.dropout
     if config.shadow:
         lost |= np.stack([_widened(e, config.shadow * unit) for e in edge])
-    if away is not None:
-        lost |= away
+    if config.grazing:
+        lost |= _grazing(clip, config.grazing)
     depths = np.where(lost | (clip.depths <= 0) | (depths <= 0), 0, depths).astype(np.float32)
     if not depths.any():  # nothing would be left to track in
         depths = clip.depths
@@ -129,15 +130,7 @@ def pose_error(rng: np.random.Generator, frames: int, degrees: float, drift: flo
     wander = np.cumsum(drift * np.radians(degrees) * rng.normal(size=(frames, 6)), 0)
     axes = rng.normal(size=(frames, 3))
     turns = axes / np.linalg.norm(axes, axis=-1, keepdims=True) * np.radians(degrees) * rng.normal(size=(frames, 1))
-    error = np.repeat(np.eye(4)[None], frames, 0)
-    error[:, :3, :3] = [cv2.Rodrigues(turn)[0] for turn in turns + wander[:, :3]]
-    error[:, :3, 3] = wander[:, 3:]
-    return error
-
-
-def _each(change: object, depths: np.ndarray) -> np.ndarray:
-    """A 3 x 3 operation of OpenCV on each frame."""
-    return np.stack([change(frame, np.ones((3, 3), np.uint8)) for frame in depths])
+    return np.stack([motion(x) for x in np.concatenate([wander[:, 3:], turns + wander[:, :3]], 1)])
 
 
 def _widened(mask: np.ndarray, width: float) -> np.ndarray:

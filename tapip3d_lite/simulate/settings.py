@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from tapip3d_lite.simulate.meshes import MESHES
+from tapip3d_lite.validate import check_range, check_types
 
 PRIMITIVES = ("sphere", "box", "cylinder", "capsule", "ellipsoid")
 SHAPES = (*PRIMITIVES, *MESHES)
@@ -63,35 +62,21 @@ class SimulationConfig:
     share_dynamic: float = 0.6
 
     def __post_init__(self) -> None:
-        tuples = "size arc moving resting shapes"
-        self._require(tuples, lambda v: isinstance(v, (tuple, list)), "a tuple", "e.g. size=(128, 128)")
-        for name in tuples.split():
-            object.__setattr__(self, name, tuple(getattr(self, name)))  # lists come from JSON and the command line
-        self._require("frames tracks", lambda v: _whole(1, v), "a whole number of at least 1", "change it")
-        for name, low in (("size", 8), ("moving", 1), ("resting", 0)):
-            wanted = f"two whole numbers of at least {low}"
-            self._require(name, lambda v, low=low: len(v) == 2 and _whole(low, *v), wanted, "change it")
-        self._require("arc moving resting", lambda v: len(v) == 2 and v[0] <= v[1], "(least, greatest)", "sort them")
-        self._require("resting", lambda v: v[1] + self.moving[1] <= 40, "at most 40 with the moving", "lower both")
-        self._require("fps speed drop", lambda v: _number(v) and v > 0, "a positive number", "1 is the usual scale")
-        self._require("handheld stereo_baseline", lambda v: _number(v) and v >= 0, "a number of at least 0", "0 is off")
-        self._require("share_dynamic", lambda v: _number(v) and 0 <= v <= 1, "a fraction in [0, 1]", "0.6 means 60 %")
-        switches = "sky same_texture occluder motion_blur"
-        self._require(switches, lambda v: isinstance(v, bool | np.bool_), "True or False", "change it")
-        self._require("camera", lambda v: v in CAMERAS, f"one of {', '.join(CAMERAS)}", "choose one of them")
-        unknown = [shape for shape in self.shapes if shape not in SHAPES]
-        self._require("shapes", lambda v: v and not unknown, f"some of {', '.join(SHAPES)}", f"drop {unknown}")
+        check_types(self)
+        check_range(self, 1, np.inf, "frames", "tracks")
+        check_range(self, 8, np.inf, "size")
+        check_range(self, 1, np.inf, "moving")
+        check_range(self, 0, np.inf, "resting", "handheld", "stereo_baseline")
+        check_range(self, 1e-12, np.inf, "fps", "speed", "drop")
+        check_range(self, 0, 1, "share_dynamic")
+        for name in ("arc", "moving", "resting"):
+            low, high = getattr(self, name)
+            self._require(name, low <= high, "(least, greatest)")
+        self._require("resting", self.resting[1] + self.moving[1] <= 40, "at most 40 with the moving")
+        self._require("camera", self.camera in CAMERAS, f"one of {', '.join(CAMERAS)}")
+        known = len(self.shapes) > 0 and all(shape in SHAPES for shape in self.shapes)
+        self._require("shapes", known, f"some of {', '.join(SHAPES)}")
 
-    def _require(self, names: str, fits: Callable[[Any], object], expected: str, remedy: str) -> None:
-        for name in names.split():
-            value = getattr(self, name)
-            if not fits(value):
-                raise ValueError(f"SimulationConfig.{name}: expected {expected}, got {value!r}; {remedy}")
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, (int, float, np.number)) and bool(np.isfinite(value))
-
-
-def _whole(low: int, *values: object) -> bool:
-    return all(isinstance(value, (int, np.integer)) and value >= low for value in values)
+    def _require(self, name: str, fits: bool, expected: str) -> None:
+        if not fits:
+            raise ValueError(f"SimulationConfig.{name}: expected {expected}, got {getattr(self, name)!r}; change it")

@@ -52,11 +52,7 @@ def simulate_rollout(seed: int = 0, config: SimulationConfig | None = None, **ov
 
 
 def render_clip(rollout: Rollout) -> Clip:
-    """Render a rollout without computing physics, so that every machine gets the same clip.
-
-    Raises:
-        ValueError: the scene that the seed makes here has other bodies than the rollout's.
-    """
+    """Render a rollout without computing physics, so that every machine gets the same clip; ValueError for other bodies."""
     return _develop(rollout, shoot(_remake(rollout), rollout))
 
 

@@ -23,9 +23,8 @@ f7f7f7 1b998b ff9b71 2d3047 fffd82|3c1642 1dd3b0 086375 affc41 b2ff9e|ef476f ffd
 _STONES = """
 e8e4da 5b5b60 a89f91 c9bfb0|d8d2c4 7a4b3a b58f76 3e3a38|cfd8d6 32494f 7f9a97 b9c7c3
 ded3e0 5a3f66 a184a8 8a6f92|efe6d0 876b3d bda26b 4f4026|3f4a4d c8cfc9 7d8b8a 1f2527"""
-_WOODS = (
-    "c99a63 8a5a2f e0bd8a 5f3a1d|a8703f 5c3317 c68f5b 3d200e|d9b382 a6784a ecd3ab 7d542d|8f5f45 57311f b98867 6f4632"
-)
+_WOODS = """
+c99a63 8a5a2f e0bd8a 5f3a1d|a8703f 5c3317 c68f5b 3d200e|d9b382 a6784a ecd3ab 7d542d|8f5f45 57311f b98867 6f4632"""
 
 
 def random_texture(

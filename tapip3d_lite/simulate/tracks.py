@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tapip3d_lite.clip import Tracks
-from tapip3d_lite.geometry import invert, project, transform, unproject
+from tapip3d_lite.geometry import in_image, invert, transform, unproject
 from tapip3d_lite.simulate.render import Shots, cast
 
 MOTION = 0.05  # metres that a body's surface must leave its first place by to count as moving
@@ -70,9 +70,7 @@ def point_visibility(shots: Shots, xyz: np.ndarray, normals: np.ndarray) -> np.n
 
     `xyz` and the normals of the seen side are (T, N, 3), world frame.
     """
-    height, width = shots.depths.shape[1:]
-    uv, z = project(xyz, shots.intrinsics, shots.extrinsics)
-    visible = (z > 0) & ((uv >= -0.5) & (uv < np.array([width, height]) - 0.5)).all(-1)
+    visible = in_image(xyz, shots.intrinsics, shots.extrinsics, shots.depths.shape[1:])
     for t, data in enumerate(shots.scene.posed(shots.states)):
         origin = invert(shots.extrinsics[t])[:3, 3]
         rays = xyz[t] - origin
