@@ -500,7 +500,7 @@ def test_the_tables_of_the_paper_have_names(monkeypatch, capsys, tmp_path):
         assert all(row.given == "lite" for row in made.plan.rows.values()) == (
             made.plan.budget == lab.BUDGETS["shipped"]
         )
-    assert len(shared) == 16  # trainings of a seed, of 51 rows
+    assert len(shared) == 16  # trainings of a seed
 
 
 @pytest.fixture(scope="module")

@@ -40,6 +40,7 @@ _SENSOR = {
         "flicker": 0.01, "noise": 0.01, "grain": 0.002, "step": 0.001, "flying": 0.5, "shadow": 1.5, "dropout": 0.05
     }
 }  # fmt: skip
+_GREY = {"degrade": {"grey": True}}
 _EDGES = {"degrade": {"silhouettes": 0.25}}
 _NEAREST, _FIXED = (29.8, 51.6, 70.9), (27.7, 50.0, 67.7)
 _SYSTEMS: dict[str, tuple] = {  # with the numbers of LSFOdyssey and of DexYCB
@@ -93,11 +94,12 @@ TABLES: dict[str, dict[str, Any]] = {
         "main table, DexYCB, a sensor's depth; without SceneTracker and camera space",
         {name: ({**one[0], **_SENSOR}, *one[2:]) for name, one in _SYSTEMS.items()},
     ),
-    "learner": _table(
-        "", {"aligned, Muon": ({},), "random start": ({"start": "random"},), "AdamW": ({"optimizer": "adamw"},)}
-    ),
+    "learner": _table("", {
+        "aligned, Muon": ({},), "random start": ({"start": "random"},), "AdamW": ({"optimizer": "adamw"},),
+        "aligned, grey video": (_GREY,), "random start, grey video": ({"start": "random", **_GREY},),
+    }),
     "controls": _table("", {
-        "n2n": ({},), "grey video": ({"degrade": {"grey": True}},), "frozen depth": ({"degrade": {"frozen": "depths"}},),
+        "n2n": ({},), "grey video": (_GREY,), "frozen depth": ({"degrade": {"frozen": "depths"}},),
         "static": ({"tracker": "static"},), "klt": ({"tracker": "klt"},),
     }),
     "K": _of_lite(
