@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, Literal
 
 import tyro
 from tqdm import tqdm
@@ -242,26 +242,24 @@ def lab(
 
     if study is None:
         print("\n".join(f"{name}: {' · '.join(values['rows'])}" for name, values in TABLES.items()))
-        return
-    if (action, study) == ("report", "paper"):
+    elif (action, study) == ("report", "paper"):
         print(f"wrote {report_all(out)}")
-        return
-    if (action, study) == ("run", "paper"):
-        if not run_all(jobs, device, accept_code, budget, seeds):
-            _stopped()
-        return
-    opened, base = open_study(study, accept_code, allow, budget, seeds, shipped=action != "run")
-    if action == "run" and not opened.run(jobs, device):
-        _stopped()
-    if action == "report":
-        print(f"wrote {opened.report(out, against or base)}")
+    elif (action, study) == ("run", "paper"):
+        _stop_unless(run_all(jobs, device, accept_code, budget, seeds))
     else:
-        print(listed(opened) if action == "list" else opened.table(against or base, metric))
+        opened, base = open_study(study, accept_code, allow, budget, seeds, shipped=action != "run")
+        if action == "run":
+            _stop_unless(opened.run(jobs, device))
+        if action == "report":
+            print(f"wrote {opened.report(out, against or base)}")
+        else:
+            print(listed(opened) if action == "list" else opened.table(against or base, metric))
 
 
-def _stopped() -> NoReturn:
-    print("stopped and saved; the same command goes on")
-    sys.exit(130)
+def _stop_unless(finished: bool) -> None:
+    if not finished:
+        print("stopped and saved; the same command goes on")
+        sys.exit(130)
 
 
 def import_(checkpoint: Positional[Path], out: Positional[Path]) -> None:
