@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, Literal
 
 import tyro
 from tqdm import tqdm
@@ -33,17 +33,18 @@ from tapip3d_lite.simulate import simulate_dataset
 from tapip3d_lite.trackers import tracker_runs
 from tapip3d_lite.training.recipe import TrainConfig
 
+Names, Paths, Box = tuple[str, ...], tuple[Path, ...], tuple[int, int, int, int]
 Format = Annotated[str, arg(help="of the clip, if it is not recognised: " + ", ".join(FORMATS[1:]))]
-ALLOW = arg(help="modules that may be imported for the custom parts that a file names")
+Trackers = Annotated[Names, arg(help="names or weights files")]
+Allowed = Annotated[Names, arg(help="modules that may be imported for the custom parts that a file names")]
 
 
 def track(
     clip: Positional[Path],
-    /,
     tracker: Annotated[str, arg(help="a name of `list_trackers()` or a weights file")] = "lite",
     format: Format = "auto",
     out: Annotated[
-        tuple[Path, ...], arg(help="results: npz (the authors'), csv, ply, mp4, gif, glb or rrd, by their suffix")
+        Paths, arg(help="results: npz (the authors'), csv, ply, mp4, gif, glb or rrd, by their suffix")
     ] = (),
     html: Annotated[Path | None, arg(help="3D page with a time slider")] = None,
     png: Annotated[Path | None, arg(help="picture of frames with tracks")] = None,
@@ -51,12 +52,10 @@ def track(
     block: Annotated[int, arg(help="how many points to track at once; fewer take less memory")] = 1024,
     space: Annotated[str | None, arg(help="world or camera; by default the learnt tracker's own")] = None,
     size: Annotated[tuple[int, int] | None, arg(help="height and width to look at (learnt trackers)")] = None,
-    crop: Annotated[
-        tuple[int, int, int, int] | None, arg(help="left, top, right, bottom to look at, in pixels")
-    ] = None,
+    crop: Annotated[Box | None, arg(help="left, top, right, bottom to look at, in pixels")] = None,
     steady: Annotated[bool, arg(help="first correct poses and depth scales that jitter")] = False,
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
-    allow: Annotated[tuple[str, ...], ALLOW] = (),
+    allow: Allowed = (),
 ) -> None:
     """Track the points of a clip in 3D."""
     for path, allowed in (*((path, WRITERS) for path in out), (html, (".html",)), (png, (".png",))):
@@ -85,12 +84,11 @@ def track(
 
 
 def evaluate(
-    clips: Positional[tuple[Path, ...]],
-    /,
-    tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("lite", "static", "klt"),
+    clips: Positional[Paths],
+    tracker: Trackers = ("lite", "static", "klt"),
     format: Format = "auto",
     device: str = "cpu",
-    allow: Annotated[tuple[str, ...], ALLOW] = (),
+    allow: Allowed = (),
 ) -> None:
     """Score trackers on clips with true tracks; prints a Markdown table, one row a clip, then the means."""
     if not (clips and tracker):
@@ -107,16 +105,14 @@ def evaluate(
 
 
 def benchmark(
-    tracker: Annotated[tuple[str, ...], arg(help="names or weights files")] = ("lite", "static", "klt"),
-    split: Annotated[
-        tuple[str, ...], arg(help="by default the first three; the others are hard: " + ", ".join(ALL))
-    ] = SPLITS,
-    space: Annotated[tuple[str, ...], arg(help="world, camera or both (learnt trackers)")] = ("world",),
+    tracker: Trackers = ("lite", "static", "klt"),
+    split: Annotated[Names, arg(help="by default the first three; the others are hard: " + ", ".join(ALL))] = SPLITS,
+    space: Annotated[Names, arg(help="world, camera or both (learnt trackers)")] = ("world",),
     count: Annotated[int | None, arg(help="only the first clips of each split")] = None,
     out: Annotated[Path | None, arg(help="JSON with every clip's scores; an interrupted run is continued")] = None,
     figure: Annotated[Path | None, arg(help="picture (PNG) of means with intervals")] = None,
     device: Annotated[str, arg(help="cpu or cuda (learnt trackers)")] = "cpu",
-    allow: Annotated[tuple[str, ...], ALLOW] = (),
+    allow: Allowed = (),
 ) -> None:
     """Score trackers on the Lite benchmark; prints Markdown tables with 95 % bootstrap intervals over clips."""
     results = run_benchmark(tracker_runs(tracker, space, device, allow), split, count, out)
@@ -131,7 +127,6 @@ def benchmark(
 
 def demo(
     clip: Positional[Path] = Path("data_samples/arc.npz"),
-    /,
     tracker: str = "lite",
     format: Format = "auto",
     out: Annotated[Path, arg(help="folder for the page and the picture")] = Path("demo_output"),
@@ -141,7 +136,7 @@ def demo(
     print(f"Open {(out / 'tracks_3d.html').resolve()} in a browser and move the time slider.")
 
 
-def check(clip: Positional[Path], /, format: Format = "auto") -> None:
+def check(clip: Positional[Path], format: Format = "auto") -> None:
     """Look for the usual mistakes in a clip: camera direction, axes, intrinsics, units, depth, order of frames, registration."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -153,7 +148,6 @@ def check(clip: Positional[Path], /, format: Format = "auto") -> None:
 def convert(
     source: Positional[Path],
     out: Positional[Path],
-    /,
     format: Format = "auto",
     depth: Annotated[str | None, arg(help="npy, npz or folder of depth to take instead; sparse, for TAPVid-3D")] = None,
     frames: Annotated[tuple[int, int, int] | None, arg(help="start, stop and step, of a folder or a video")] = None,
@@ -184,7 +178,7 @@ def train(
     workers: Annotated[int | None, arg(help="processes for examples; default: 0 on a CPU, else cores less two")] = None,
     compiled: Annotated[bool, arg(help="compile the tracker's parts, for a GPU: slow to start, then faster")] = False,
     loss: Annotated[str | None, arg(help="paper, pixels, or your own: my_parts:MyLoss")] = None,
-    allow: Annotated[tuple[str, ...], ALLOW] = (),
+    allow: Allowed = (),
 ) -> None:
     """Train a tracker on simulated clips, by default with the recipe of --preset (lite or paper); Ctrl-C saves and stops, --resume continues exactly there."""
     from tapip3d_lite.lab.train import train as run
@@ -202,14 +196,13 @@ def train(
 def card(
     folder: Positional[Path],
     results: Positional[Path],
-    /,
     hardware: Annotated[str, arg(help="what it was trained on, in words")],
     out: Annotated[Path, arg(help="Markdown file")] = Path("MODEL_CARD.md"),
     name: Annotated[str, arg(help="of the model")] = "lite",
     weights: Annotated[Path | None, arg(help="the file, if not the folder's own")] = None,
     command: Annotated[str | None, arg(help="that made it, shown beside the recipe")] = None,
     also: Annotated[Path | None, arg(help="Markdown file to put before the limits")] = None,
-    allow: Annotated[tuple[str, ...], ALLOW] = (),
+    allow: Allowed = (),
 ) -> None:
     """Write the model card of a training folder and of results that `benchmark --out` wrote."""
     write_text(out, model_card(folder, results, hardware, name, command, weights, also, allow))
@@ -217,8 +210,7 @@ def card(
 
 
 def curves(
-    folders: Positional[Annotated[tuple[Path, ...], arg(help="of trainings, or their log.jsonl; one row each")]],
-    /,
+    folders: Positional[Annotated[Paths, arg(help="of trainings, or their log.jsonl; one row each")]],
     out: Annotated[Path, arg(help="picture (PNG)")] = Path("learning_curves.png"),
     by: Annotated[str, arg(help="step or minutes")] = "step",
 ) -> None:
@@ -234,51 +226,44 @@ def curves(
 
 def lab(
     action: Positional[Annotated[Literal["run", "table", "report", "list"], arg(help="what to do with the study")]],
-    study: Positional[
-        Annotated[str | None, arg(help="TOML or JSON file, folder, a table of the paper, or `paper`")]
-    ] = None,
-    /,
+    study: Positional[Annotated[str | None, arg(help="TOML or JSON file, folder, table's name, or `paper`")]] = None,
     jobs: Annotated[int, arg(help="trainings at once (run)")] = 1,
     device: Annotated[str, arg(help="cpu or cuda (run)")] = "cpu",
     against: Annotated[str | None, arg(help="the row that others are compared with")] = None,
-    metric: Annotated[tuple[str, ...], arg(help="that judge, the first one first")] = JUDGED,
+    metric: Annotated[Names, arg(help="that judge, the first one first")] = JUDGED,
     out: Annotated[Path, arg(help="folder (report)")] = Path("report"),
-    budget: Annotated[
-        str | None, arg(help="in place of the study's own: lab, gpu, tiny (seconds a row) or shipped")
-    ] = None,
+    budget: Annotated[str | None, arg(help="in place of its own: lab, gpu, tiny (seconds a row) or shipped")] = None,
     seeds: Annotated[int | None, arg(help="trainings of each row, in place of the study's own number")] = None,
     accept_code: Annotated[bool, arg(help="go on with results of other code")] = False,
-    allow: Annotated[tuple[str, ...], ALLOW] = (),
+    allow: Allowed = (),
 ) -> None:
     """Run a study of rows under equal conditions; its table, its report, its rows, or the paper's tables by name."""
     from tapip3d_lite.lab.papers import TABLES, listed, open_study, report_all, run_all
 
     if study is None:
         print("\n".join(f"{name}: {' · '.join(values['rows'])}" for name, values in TABLES.items()))
-        return
-    if (action, study) == ("report", "paper"):
+    elif (action, study) == ("report", "paper"):
         print(f"wrote {report_all(out)}")
-        return
-    if (action, study) == ("run", "paper"):
-        if not run_all(jobs, device, accept_code, budget, seeds):
-            _stopped()
+    elif (action, study) == ("run", "paper"):
+        _stop_unless(run_all(jobs, device, accept_code, budget, seeds))
         print("finished; `lab report paper` writes what the tables say")
-        return
-    opened, base = open_study(study, accept_code, allow, budget, seeds, shipped=action != "run")
-    if action == "run" and not opened.run(jobs, device):
-        _stopped()
-    if action == "report":
-        print(f"wrote {opened.report(out, against or base)}")
     else:
-        print(listed(opened) if action == "list" else opened.table(against or base, metric))
+        opened, base = open_study(study, accept_code, allow, budget, seeds, shipped=action != "run")
+        if action == "run":
+            _stop_unless(opened.run(jobs, device))
+        if action == "report":
+            print(f"wrote {opened.report(out, against or base)}")
+        else:
+            print(listed(opened) if action == "list" else opened.table(against or base, metric))
 
 
-def _stopped() -> NoReturn:
-    print("stopped and saved; the same command goes on")
-    sys.exit(130)
+def _stop_unless(finished: bool) -> None:
+    if not finished:
+        print("stopped and saved; the same command goes on")
+        sys.exit(130)
 
 
-def import_(checkpoint: Positional[Path], out: Positional[Path], /) -> None:
+def import_(checkpoint: Positional[Path], out: Positional[Path]) -> None:
     """Convert the authors' checkpoint (.pth) to a weights file of ours (.safetensors)."""
     tracker = t3d.load_official(checkpoint)
     t3d.save_weights(tracker, out)

@@ -50,20 +50,19 @@ def cost_figure(rows: Mapping[str, tuple[float, Mapping[str, float]]], cost: str
     return figure
 
 
-def where_they_differ(seen: Mapping[str, tuple[Clip, Tracks]], columns: int = 4) -> Figure:
-    """The track on which two rows differ most: in frames of the clip, and their 3D errors over time.
+def where_they_differ(seen: Mapping[str, tuple[Clip, Tracks]]) -> Figure:
+    """The track on which two rows differ most: in four frames of the clip, and their 3D errors over time.
 
     Args:
         seen: of two rows by name: the clip as the row saw it, with true tracks, and the row's tracks.
-        columns: number of frames.
     """
     errors = [np.linalg.norm(tracks.xyz - clip.tracks.xyz, axis=-1) for clip, tracks in seen.values()]  # (T, N)
     shown = next(iter(seen.values()))[0]
     gap = np.where(shown.tracks.visible, np.abs(errors[0] - errors[1]), 0)
     n = int(gap.mean(0).argmax())
-    figure = Figure(figsize=(2.5 * columns, 4.6), layout="constrained")
-    grid = figure.add_gridspec(2, columns, height_ratios=[1.6, 1])
-    for column, t in enumerate(np.linspace(0, len(shown) - 1, columns).astype(int)):
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    grid = figure.add_gridspec(2, 4, height_ratios=[1.6, 1])
+    for column, t in enumerate(np.linspace(0, len(shown) - 1, 4).astype(int)):
         ax = figure.add_subplot(grid[0, column])
         draw_image(ax, shown.video[t], f"frame {t}")
         _path(ax, shown, shown.tracks, n, t, _TRUTH)

@@ -17,6 +17,7 @@ from tapip3d_lite.figures.flat import INK, MOVING, STILL, label_axes
 COLORS = ("#8a8f98", "#e8a33d", "#2b6cb0", "#d1495b", "#2f855a", "#6b46c1")
 NAMES = {"AJ3D_none": "AJ 3D", "APD3D_none": "APD 3D", "AJ3D": "AJ 3D, median scale", "APD3D": "APD 3D, median scale"}
 Line = Mapping[str, Any]
+Log = tuple[str, Sequence[Line]]
 _SERIES = {"apd": ("all points", STILL), "apd_dynamic": ("moving points", MOVING)}
 
 
@@ -58,10 +59,7 @@ def score_figure(
 
 
 def learning_curves(
-    logs: Sequence[tuple[str, Sequence[Line]]],
-    zero_motion: Mapping[str, float] | None = None,
-    by: str = "step",
-    window: int = 100,
+    logs: Sequence[Log], zero_motion: Mapping[str, float] | None = None, by: str = "step", window: int = 100
 ) -> Figure:
     """How trainings went, one row each: matching of the encoder, loss, APD3D on examples (lines) and held-out clips (dots).
 

@@ -15,8 +15,6 @@ from tapip3d_lite.validate import checked
 
 INK = "#30343b"
 STILL, MOVING = "#2b6cb0", "#d1495b"  # points at rest, points on moving bodies
-
-
 _PALETTE, _ENDS = matplotlib.colormaps["plasma"], (0.02, 0.93)  # its order is seen by the colour-blind, too
 PLACES = tuple(_PALETTE(end)[:3] for end in _ENDS)  # colours of tracks that begin top left and bottom right
 

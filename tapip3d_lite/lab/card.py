@@ -36,8 +36,7 @@ def model_card(
 
     `folder` holds `config.json`, `log.jsonl` and the weights, unless these lie elsewhere (`weights`); `results` is what
     `benchmark --out` wrote, `also` a Markdown file to put before the limits. Files cannot know the `hardware`, nor a
-    `command` that is to be shown beside the recipe.
-    Custom `parts` that they name must be given, as for `load_tracker`.
+    `command` that is to be shown beside the recipe. Custom `parts` that they name must be given, as for `load_tracker`.
     """
     folder = Path(folder)
     path = Path(weights) if weights else folder / "weights.safetensors"

@@ -48,15 +48,8 @@ def make_trainer(
 ) -> Trainer:
     """A trainer that also scores the tracker on held-out clips, every `config.evaluate_every` steps.
 
-    Args:
-        folder: of the training; made if missing.
-        config: the recipe.
-        clips: training clips (npz files with tracks) of any image size.
-        validation: held-out clips with true tracks; none: the tracker is not scored.
-        options: of `Trainer`: `device`, `resume`, `workers`, `compiled`, `encoder`.
-
-    Raises:
-        ValueError: as `Trainer` does.
+    `validation` are held-out clips with true tracks; without any the tracker is not scored. All other arguments
+    (`options`: `device`, `resume`, `workers`, `compiled`, `encoder`) and the errors are those of `Trainer`.
     """
     for clip in validation:
         check_depths(clip.depths, config.tracker_config().window)

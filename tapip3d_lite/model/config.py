@@ -143,8 +143,7 @@ class TrackerConfig:
         """
         if name not in _PRESETS:
             raise ValueError(f"TrackerConfig.preset: expected one of {', '.join(_PRESETS)}, got {name!r}")
-        unknown = sorted(set(changes) - {field.name for field in fields(cls)})
-        if unknown:
+        if unknown := sorted(changes.keys() - cls.__dataclass_fields__):
             raise ValueError(f"TrackerConfig.preset: no field {', '.join(unknown)}; see TrackerConfig's attributes")
         return cls(**(_PRESETS[name] | changes))
 
@@ -167,8 +166,7 @@ class TrackerConfig:
     @classmethod
     def from_dict(cls, values: dict[str, Any], parts: Sequence[Any] = ()) -> TrackerConfig:
         """The inverse of `to_dict`; ValueError names unknown fields, and classes not among `parts` (see `load_tracker`)."""
-        unknown = sorted(set(values) - {field.name for field in fields(cls)})
-        if unknown:
+        if unknown := sorted(values.keys() - cls.__dataclass_fields__):
             raise ValueError(f"TrackerConfig: unknown fields {', '.join(unknown)}; the file is from another version")
         return cls(**(values | allowed_parts(values, SWITCHES, parts)))
 

@@ -37,12 +37,8 @@ class Frames:
     extrinsics: Tensor
 
     def __post_init__(self) -> None:
-        batch, count, height, width = self.depths.shape
-        expected = {
-            "rgb": (batch, count, 3, height, width),
-            "intrinsics": (batch, count, 3, 3),
-            "extrinsics": (batch, count, 4, 4),
-        }
+        lead, size = self.depths.shape[:2], self.depths.shape[2:]
+        expected = {"rgb": (*lead, 3, *size), "intrinsics": (*lead, 3, 3), "extrinsics": (*lead, 4, 4)}
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise ValueError(

@@ -105,14 +105,10 @@ def knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = None
         raise ValueError(f"knn: asked for {count} neighbours among {points.shape[1]} points; lower neighbors or levels")
     frames, total = points.shape[:2]
     step = max(1, _BUDGET * (16 if queries.is_cuda else 1) // (frames * total))
-    queries, points = queries.float(), points.float()
-    chunks = [_nearest(chunk, points, count, valid) for chunk in queries.split(step, 1)]
-    return torch.cat(chunks, 1) if chunks else queries.new_zeros((frames, 0, count), dtype=torch.long)
-
-
-def _nearest(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) -> Tensor:
-    distance = squared_distances(queries, points, valid)  # (F, N, P)
-    return nearest_first(distance, torch.arange(distance.shape[-1], device=distance.device), count, valid is not None)
+    points, indices, masked = points.float(), torch.arange(total, device=points.device), valid is not None
+    parts = queries.float().split(step, 1)
+    near = [nearest_first(squared_distances(part, points, valid), indices, count, masked) for part in parts]
+    return torch.cat(near, 1)  # (F, N, K)
 
 
 def nearest_first(distance: Tensor, indices: Tensor, count: int, masked: bool) -> Tensor:

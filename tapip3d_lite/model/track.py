@@ -87,7 +87,8 @@ def track(
     clip = _prepared(clip, tracker.config, crop)
     roi = quantile_roi(torch.from_numpy(clip.depths)) if isinstance(depth_roi, str) else depth_roi
     options = {"iterations": iterations, "space": space, "depth_roi": roi}
-    grids = [_grid(clip, support_grid, frame) for frame in (0, len(clip) - 1)]
+    ends = (0, len(clip) - 1)
+    grids = [support_queries(clip, support_grid, frame) if support_grid else queries[:0] for frame in ends]
     backward = bidirectional and bool((queries[:, 0] > 0).any())
     ways, begun = _ways(tracker, clip), np.arange(len(clip))[:, None] >= queries[:, 0]  # (T, N)
     with _bar(progress, tracker, len(clip), iterations, 1 + backward) as bar:
@@ -160,10 +161,6 @@ def _streamed(
 def _one_way(way: Callable, queries: np.ndarray, grid: np.ndarray, options: dict) -> tuple[np.ndarray, np.ndarray]:
     xyz, logits = way(np.concatenate([queries, grid]).astype(np.float32), **options)
     return xyz[:, : len(queries)], logits[:, : len(queries)]
-
-
-def _grid(clip: Clip, side: int, frame: int) -> np.ndarray:
-    return support_queries(clip, side, frame) if side else np.zeros((0, 4), np.float32)
 
 
 def _flip_time(rows: np.ndarray, frames: int) -> np.ndarray:

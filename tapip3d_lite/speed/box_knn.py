@@ -54,8 +54,8 @@ def run_knn(queries: Tensor, points: Tensor, count: int, valid: Tensor | None = 
     if total % _RUN or total <= 2 * _RUN * count:
         return knn(queries, points, count, valid)
     step = max(1, 2**28 // (len(points) * total))
-    parts = [_nearest_of_runs(part, points.float(), count, valid) for part in queries.float().split(step, 1)]
-    return torch.cat(parts, 1) if parts else knn(queries, points, count, valid)
+    parts = queries.float().split(step, 1)
+    return torch.cat([_nearest_of_runs(part, points.float(), count, valid) for part in parts], 1)
 
 
 def _nearest_of_runs(queries: Tensor, points: Tensor, count: int, valid: Tensor | None) -> Tensor:

@@ -71,9 +71,8 @@ class AugmentConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_range(
-            self, 0, 1, "erase", "jitter", "jitter_strength", "blur", "depth_blur", "reframe", "flip_x", "flip_y"
-        )
+        check_range(self, 0, 1, "erase", "jitter", "jitter_strength", "blur", "depth_blur")
+        check_range(self, 0, 1, "reframe", "flip_x", "flip_y")
         check_range(self, 0, math.inf, "pad", "drift")
         check_range(self, 1, math.inf, "erase_boxes")
         for name in ("erase_side", "blur_sigma", "depth_blur_sigma", "scale"):
@@ -216,8 +215,9 @@ def reframe(clip: Clip, scale: float, offsets: np.ndarray) -> Clip:
     camera = np.repeat(np.diag([scale, scale, 1.0])[None], len(clip), 0)
     camera[:, :2, 2] = -offsets
     shape = clip.size[::-1]
-    video = np.stack([_warp(image, m, shape) for image, m in zip(clip.video, camera, strict=True)])
-    depths = np.stack([_warp_depth(depth, m, shape) for depth, m in zip(clip.depths, camera, strict=True)])
+    matrices = camera[:, :2]
+    video = np.stack([cv2.warpAffine(image, m, shape) for image, m in zip(clip.video, matrices, strict=True)])
+    depths = np.stack([_warp_depth(depth, m, shape) for depth, m in zip(clip.depths, matrices, strict=True)])
     intrinsics = (camera @ clip.intrinsics).astype(np.float32)
     uv, _ = project(clip.tracks.xyz, intrinsics, clip.extrinsics)
     inside = ((uv >= -0.5) & (uv < np.array(shape) - 0.5)).all(-1)
@@ -243,12 +243,9 @@ def flip(clip: Clip, axis: int) -> Clip:
     return replace(clip, **images, **cameras, queries=queries, tracks=tracks, extras={})
 
 
-def _warp(image: np.ndarray, matrix: np.ndarray, shape: tuple[int, int], flags: int = cv2.INTER_LINEAR) -> np.ndarray:
-    return cv2.warpAffine(image, matrix[:2], shape, flags=flags)
-
-
 def _warp_depth(depth: np.ndarray, matrix: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
-    smooth, nearest = _warp(inverse, matrix, shape), _warp(depth, matrix, shape, cv2.INTER_NEAREST)
+    smooth = cv2.warpAffine(inverse, matrix, shape)
+    nearest = cv2.warpAffine(depth, matrix, shape, flags=cv2.INTER_NEAREST)
     same = np.abs(smooth * nearest - 1) < SAME_SURFACE
     return np.divide(1, smooth, out=nearest, where=same)

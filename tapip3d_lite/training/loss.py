@@ -84,8 +84,9 @@ class LossConfig:
 
         Returns:
             Terms of position and of visibility, two finite scalars whose sum is minimised, the mean of what each clip
-            has alone. Not counted are frames before the query and after the clip's end, inactive tracks, and positions
-            that are NaN. A class is called without arguments once; what it learnt itself would not be trained.
+            has alone. Not counted are frames before the query, padded frames (repetitions of the last one), inactive
+            tracks, which only fill up the batch, and positions that are NaN. A class is called without arguments once;
+            what it learnt itself would not be trained.
         """
         return step_loss(step, truth, iterations, self)
 
@@ -94,11 +95,7 @@ Loss = Callable[[Step, Truth, int], tuple[Tensor, Tensor]]
 
 
 def step_loss(step: Step, truth: Truth, iterations: int, config: LossConfig) -> tuple[Tensor, Tensor]:
-    """Position and visibility terms of one of M updates, weighted and discounted: two scalars whose sum is minimised.
-
-    `truth` has all frames and tracks of the batch. Frames before the query, padded frames (repetitions of the last one)
-    and inactive tracks, which only fill up the batch, do not count.
-    """
+    """Position and visibility terms of one of M updates, weighted and discounted; see `LossConfig.__call__`."""
     target, visible, counted, depth, focal = compared(step, truth)
     depth = depth.clamp(min=0.1)
     pixels = (step.xyz - target).square().sum(-1).add(1e-12).sqrt() / depth * focal

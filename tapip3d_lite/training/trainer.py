@@ -137,22 +137,19 @@ class Trainer:
         When the caller asks for the next step and `stop()` is true, everything is saved instead.
         """
         with self.folder.locked() if self.group.is_main else nullcontext():
-            yield from self._steps(stop)
-
-    def _steps(self, stop: Callable[[], bool]) -> Iterator[dict]:
-        self.schedule.start_clock()
-        halted = False
-        while not self.schedule.finished and not halted:
-            yield self._one_step()
-            halted = self.group.sum(stop()) > 0
-            due = halted or self.schedule.finished or self.step % self.config.save_every == 0
-            if due and self.group.is_main:
-                parts = {"model": self.tracker, "optimizer": self.optimizer, "average": self.average}
-                state = {name: part.state_dict() for name, part in parts.items()}
-                counts = {"step": self.step, "position": self.schedule.position, "seconds": self.seconds}
-                self.folder.save(state | counts)
-        if self.schedule.finished and self.group.is_main:
-            save_weights(self.average, self.folder.path / "weights.safetensors", half=True)
+            self.schedule.start_clock()
+            halted = False
+            while not self.schedule.finished and not halted:
+                yield self._one_step()
+                halted = self.group.sum(stop()) > 0
+                due = halted or self.schedule.finished or self.step % self.config.save_every == 0
+                if due and self.group.is_main:
+                    parts = {"model": self.tracker, "optimizer": self.optimizer, "average": self.average}
+                    state = {name: part.state_dict() for name, part in parts.items()}
+                    counts = {"step": self.step, "position": self.schedule.position, "seconds": self.seconds}
+                    self.folder.save(state | counts)
+            if self.schedule.finished and self.group.is_main:
+                save_weights(self.average, self.folder.path / "weights.safetensors", half=True)
 
     def example(self) -> list[FramePair] | Batch:
         """The input of the next step."""
