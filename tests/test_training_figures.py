@@ -76,8 +76,12 @@ def test_trainings_have_a_row_each_and_the_command_draws_them(lines, tmp_path):
     rows = np.reshape(figure.axes, (2, 3))
     assert [row[0].get_ylabel().splitlines()[0] for row in rows] == ["first", "second"]
     assert drawn(rows[0, 1]) == drawn(learning_curves([("", lines)], window=2).axes[1]) and not rows[1, 1].lines
-    texts = [[text.get_text() for text in learning_curve(part).axes[0].texts] for part in (lines, lines[2:])]
+    both = np.reshape(learning_curves([("", lines), ("", lines[2:])]).axes, (2, 3))
+    texts = [[text.get_text() for text in row[0].texts] for row in both]
     assert texts == [[], ["as it was"]]  # a training that takes its encoder as it finds it
+    assert [ax.get_ylabel() for ax in learning_curve(lines[2:]).axes] == ["loss", "APD3D"]
+    few = [{**lines[2], "step": step, "loss": loss} for step, loss in ((10, 0.4), (20, 0.2), (30, 0.6))]
+    assert drawn(learning_curves([("", few)], window=20).axes[0])[1] == ([10, 20, 30], [0.4, 0.3, 0.4])
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     command = [sys.executable, "-m", "tapip3d_lite", "curves", "--out", str(tmp_path / "c.png")]
     subprocess.run([*command, str(tmp_path), str(tmp_path / "log.jsonl")], check=True, cwd=tiny.ROOT)

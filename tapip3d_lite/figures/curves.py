@@ -63,19 +63,22 @@ def learning_curves(
 ) -> Figure:
     """How trainings went, one row each: matching of the encoder, loss, APD3D on examples (lines) and held-out clips (dots).
 
+    Where all of them took their encoder over, there is nothing to draw of the first.
+
     Args:
         logs: name and lines of the log of each training; there may be no lines yet, and the name may be empty.
         zero_motion: scores of zero motion on the held-out clips, drawn dashed: `APD3D_none`, `APD3D_none_dynamic`.
         by: horizontal axis, `"step"` or `"minutes"` of training.
-        window: steps over which the bold lines are averaged; the raw values stay behind them.
+        window: steps over which the bold lines are averaged, also where a log has only some; the raw values stay behind.
 
     Raises:
         ValueError: another `by`, or a window of no step.
     """
     if by not in ("step", "minutes") or window < 1:
         raise ValueError(f'learning_curves: expected by="step" or "minutes", window >= 1, got {by!r}, {window}')
-    figure = Figure(figsize=(11, 2.9 * len(logs)), layout="constrained")
-    rows = figure.subplots(len(logs), 3, squeeze=False)
+    taken = all(lines and not _stage(lines, "matching") for _, lines in logs)
+    figure = Figure(figsize=(8 if taken else 11, 2.9 * len(logs)), layout="constrained")
+    rows = figure.subplots(len(logs), 2 if taken else 3, squeeze=False)
     for axes, (name, lines) in zip(rows, logs, strict=True):
         _row(axes, lines, zero_motion or {}, by, window)
         if name:
@@ -98,44 +101,67 @@ def _dot(color: str, filled: bool) -> dict[str, Any]:
 
 
 def _row(axes: Sequence[Axes], lines: Sequence[Line], zero_motion: Mapping[str, float], by: str, window: int) -> None:
-    matching, tracking = ([line for line in lines if line["stage"] == name] for name in ("matching", "tracking"))
+    matching, tracking = (_stage(lines, name) for name in ("matching", "tracking"))
     titles = ["the encoder learns to match", "the tracker learns to track"]
-    titles += ["bold: examples · dots: held out · dashed: zero motion"]
-    for ax, title, label in zip(axes, titles, ("right within 1.5 cells", "loss", "APD3D"), strict=True):
+    titles += ["bold: examples · dots: held out" + " · dashed: zero motion" * bool(zero_motion)]
+    for ax, title, label in list(
+        zip(axes[::-1], titles[::-1], ("APD3D", "loss", "right within 1.5 cells"), strict=False)
+    ):
         label_axes(ax, label, by)
         ax.set_title(title, fontsize=8, color=INK)
-    _curve(axes[0], *_points(matching, "right", by), window, INK)
-    _curve(axes[1], *_points(tracking, "loss", by), window, INK)
+    if len(axes) == 3:
+        _draw_matching(axes[0], matching, by, window, taken=bool(tracking and not matching))
+    losses, scores = axes[-2:]
+    _curve(losses, tracking, "loss", by, window, INK)
     for name, (label, color) in _SERIES.items():
-        _curve(axes[2], *_points(tracking, name, by), window, color, label)
+        _curve(scores, tracking, name, by, window, color, label)
         held_out = name.replace("apd", "APD3D_none")
-        axes[2].plot(*_points(tracking, f"val_{held_out}", by), "o", color=color, ms=5, mec="white", mew=0.6)
+        known = _known(tracking, f"val_{held_out}")
+        scores.plot(
+            _place(known, by), [x[f"val_{held_out}"] for x in known], "o", color=color, ms=5, mec="white", mew=0.6
+        )
         if held_out in zero_motion:
-            axes[2].axhline(zero_motion[held_out], color=color, lw=1, ls="--")
-    if tracking and not matching:
-        axes[0].text(0.5, 0.5, "as it was", ha="center", color=INK, fontsize=8, transform=axes[0].transAxes)
-        axes[0].set(xticks=[], yticks=[])
-    axes[0].set_ylim(0, 1)
-    axes[2].set_ylim(0, 1)
+            scores.axhline(zero_motion[held_out], color=color, lw=1, ls="--")
+    scores.set_ylim(0, 1)
     if tracking:
-        axes[1].set_yscale("log")
-        axes[1].tick_params(which="minor", labelsize=7)
-        axes[2].legend(fontsize=7, frameon=False, loc="upper left")
+        losses.set_yscale("log")
+        losses.tick_params(which="minor", labelsize=7)
+        scores.legend(fontsize=7, frameon=False, loc="upper left")
 
 
-def _points(lines: Sequence[Line], name: str, by: str) -> tuple[np.ndarray, np.ndarray]:
-    """Where on the horizontal axis the lines have a value of that name, and the values."""
-    known = [line for line in lines if line.get(name) is not None]
-    x = [line["step"] if by == "step" else line["seconds"] / 60 for line in known]
-    return np.array(x), np.array([line[name] for line in known])
+def _draw_matching(ax: Axes, lines: Sequence[Line], by: str, window: int, taken: bool) -> None:
+    _curve(ax, lines, "right", by, window, INK)
+    if taken:
+        ax.text(0.5, 0.5, "as it was", ha="center", color=INK, fontsize=8, transform=ax.transAxes)
+        ax.set(xticks=[], yticks=[])
+    ax.set_ylim(0, 1)
 
 
-def _curve(ax: Axes, x: np.ndarray, y: np.ndarray, window: int, color: str, label: str | None = None) -> None:
-    """Raw values, faint, and in bold their means over the last `window`."""
-    if not len(y):
+def _stage(lines: Sequence[Line], name: str) -> list[Line]:
+    return [line for line in lines if line["stage"] == name]
+
+
+def _known(lines: Sequence[Line], name: str) -> list[Line]:
+    return [line for line in lines if line.get(name) is not None]
+
+
+def _place(lines: Sequence[Line], by: str) -> list[float]:
+    return [line["step"] if by == "step" else line["seconds"] / 60 for line in lines]
+
+
+def _curve(
+    ax: Axes, lines: Sequence[Line], name: str, by: str, window: int, color: str, label: str | None = None
+) -> None:
+    """Raw values, faint, and in bold their means over the last `window` steps."""
+    lines = _known(lines, name)
+    if not lines:
         return
-    sums = np.concatenate([[0.0], np.cumsum(y)])
-    stops = np.arange(1, len(y) + 1)
-    starts = np.maximum(stops - window, 0)
+    x, y, steps = (
+        _place(lines, by),
+        np.array([line[name] for line in lines]),
+        np.array([line["step"] for line in lines]),
+    )
+    sums, stops = np.concatenate([[0.0], np.cumsum(y)]), np.arange(1, len(y) + 1)
+    starts = np.searchsorted(steps, steps - window, side="right")
     ax.plot(x, y, color=color, lw=0.4, alpha=0.25)
     ax.plot(x, (sums[stops] - sums[starts]) / (stops - starts), color=color, lw=1.8, label=label)

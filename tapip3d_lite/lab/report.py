@@ -16,7 +16,7 @@ from tapip3d_lite.figures import png_bytes, save_png
 from tapip3d_lite.figures.comparisons import cost_figure, forest_figure
 from tapip3d_lite.figures.curves import Line, learning_curves
 from tapip3d_lite.files import write_text
-from tapip3d_lite.lab.table import Results, Table, gaps_by_clip
+from tapip3d_lite.lab.table import TITLES, Results, Table, gaps_by_clip
 
 
 def write_report(
@@ -33,11 +33,12 @@ def write_report(
     many clips of each pair to list.
     """
     metric = table.metrics[0]
+    title = TITLES.get(metric, metric)
     rows = [row for row in table.rows if not math.isnan(row[metric]["mean"])]
-    figures = {"intervals": forest_figure({x["row"]: x[metric] for x in rows}, table.against, metric)}
+    figures = {"intervals": forest_figure({x["row"]: x[metric] for x in rows}, table.against, title)}
     if any(row["multiply_adds"] for row in rows):
         points = {x["row"]: (x["multiply_adds"] / 1e6, x[metric]) for x in rows if x["multiply_adds"]}
-        figures["costs"] = cost_figure(points, "multiply-adds for each query and frame (M)", metric)
+        figures["costs"] = cost_figure(points, "multiply-adds for each query and frame (M)", title)
     if logs:
         figures["curves"] = learning_curves(list(logs.items()))
     gaps = {x["row"]: gaps_by_clip(results, x["row"], table.against, metric) for x in rows if x["row"] != table.against}
@@ -46,7 +47,7 @@ def write_report(
     parts = [f"# {', '.join(plan['rows'])}", str(table)]
     parts += [f"![{name}]({name}.png)" for name in figures]
     if cells:
-        parts += [f"Clips on which rows differ most ({metric}, mean over seeds):", markdown_table(head, cells)]
+        parts += [f"Clips on which rows differ most ({title}, mean over seeds):", markdown_table(head, cells)]
     parts += ["## Made with", f"```json\n{json.dumps({k: v for k, v in plan.items() if k != 'code'}, indent=1)}\n```"]
     for name, figure in figures.items():
         save_png(figure, folder / f"{name}.png")
