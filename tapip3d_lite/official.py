@@ -111,7 +111,7 @@ def official_config(cfg: Mapping[str, Any]) -> TrackerConfig:
     model = cfg.get("model") if isinstance(cfg, Mapping) else None
     if not isinstance(model, Mapping):
         raise ValueError(f"cfg: expected a mapping with a mapping 'model', got {str(cfg)[:200]}")
-    flat = {k: v for k, v in _flatten(model).items() if k not in _IGNORED}
+    flat = {k: v for k, v in flatten(model).items() if k not in _IGNORED}
     for key, allowed in _REQUIRED.items():
         value = flat.pop(key, allowed[0])
         if value not in allowed:
@@ -124,7 +124,7 @@ def official_config(cfg: Mapping[str, Any]) -> TrackerConfig:
         ours[field] = value
     if flat:
         raise ValueError(f"cfg.model: unknown options {', '.join(sorted(flat))}; they might change the numbers")
-    size = model.get("image_size") or _flatten(cfg).get("train_dataset.resolution") or (384, 512)
+    size = model.get("image_size") or flatten(cfg).get("train_dataset.resolution") or (384, 512)
     # The released updater's heads are 48 wide, whatever its width.
     return TrackerConfig(image_size=size, as_released=True, space="world", head_dim=48, **ours)
 
@@ -185,10 +185,11 @@ def _check_time(tracker: Tracker, value: Tensor | None) -> None:
         raise ValueError(f"state['time_emb']: expected sinusoids of shape {tuple(expected.shape)}, got {got}")
 
 
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested values by dotted names."""
     flat = {}
     for key, value in values.items():
-        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return flat
 
 

@@ -63,8 +63,6 @@ def learning_curves(
 ) -> Figure:
     """How trainings went, one row each: matching of the encoder, loss, APD3D on examples (lines) and held-out clips (dots).
 
-    Where all of them took their encoder over, there is nothing to draw of the first.
-
     Args:
         logs: name and lines of the log of each training; there may be no lines yet, and the name may be empty.
         zero_motion: scores of zero motion on the held-out clips, drawn dashed: `APD3D_none`, `APD3D_none_dynamic`.
@@ -76,7 +74,7 @@ def learning_curves(
     """
     if by not in ("step", "minutes") or window < 1:
         raise ValueError(f'learning_curves: expected by="step" or "minutes", window >= 1, got {by!r}, {window}')
-    taken = all(lines and not _stage(lines, "matching") for _, lines in logs)
+    taken = all(lines and not _stage(lines, "matching") for _, lines in logs)  # no encoder was trained
     figure = Figure(figsize=(8 if taken else 11, 2.9 * len(logs)), layout="constrained")
     rows = figure.subplots(len(logs), 2 if taken else 3, squeeze=False)
     for axes, (name, lines) in zip(rows, logs, strict=True):

@@ -205,7 +205,8 @@ def run_all(
 ) -> bool:
     """Run all tables of the paper, with `budget` in place of `"lab"`; as `Study.run`."""
     budgets = {name: None if "budget" in table else budget for name, table in TABLES.items()}
-    return run_together([open_study(name, accept_code, (), budgets[name], seeds)[0] for name in TABLES], jobs, device)
+    studies = [open_study(name, accept_code, (), budgets[name], seeds)[0] for name in TABLES]
+    return run_together(studies, jobs, device, lambda: False, progress=True)
 
 
 def report_all(folder: Path) -> Path:

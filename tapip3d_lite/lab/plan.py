@@ -8,6 +8,7 @@ store/trainings/s0-<key>/    of a recipe with seed 0; rows and studies with the 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -202,11 +203,8 @@ def shared(jobs: Iterable[Job]) -> list[Job]:
         first = found.setdefault(job.folder or i, job)
         if first is not job:
             found[job.folder] = replace(first, rows=first.rows + job.rows)
-    names = [job.name for job in found.values()]
-    return [
-        job if names.count(job.name) == 1 else replace(job, name=f"{job.name} #{i}")
-        for i, job in enumerate(found.values(), 1)
-    ]
+    counts = Counter(job.name for job in found.values())
+    return [replace(x, name=x.name + f" #{i}" * (counts[x.name] > 1)) for i, x in enumerate(found.values(), 1)]
 
 
 def is_scored(file: Path, key: str) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import version
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tapip3d_lite.files import digest, read_json
+from tapip3d_lite.official import flatten
 from tapip3d_lite.parts import part_name
 
 _ROOT = Path(__file__).parents[1]
@@ -45,7 +45,7 @@ def diff(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:
     Raises:
         ValueError: a folder without a config.
     """
-    a, b = _flat(_config(one)), _flat(_config(other))
+    a, b = flatten(_config(one)), flatten(_config(other))
     return {name: (a.get(name), b.get(name)) for name in {**a, **b} if a.get(name) != b.get(name)}
 
 
@@ -56,13 +56,6 @@ def _config(source: Any) -> Any:
                 return read_json(path)
         raise ValueError(f"diff: {source} holds neither config.json nor study.json; give another folder")
     return source.to_dict() if hasattr(source, "to_dict") else json.loads(json.dumps(source, default=plain))
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found = {}
-    for name, value in values.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
-    return found
 
 
 @cache

@@ -187,13 +187,7 @@ class Study:
         return explorer(list(self.plan.rows), self.plan.seeds, clips, self.draw)
 
 
-def run_together(
-    studies: Sequence[Study],
-    jobs: int = 1,
-    device: str = "cpu",
-    stop: Callable[[], bool] = lambda: False,
-    progress: bool = True,
-) -> bool:
+def run_together(studies: Sequence[Study], jobs: int, device: str, stop: Callable[[], bool], progress: bool) -> bool:
     """`Study.run` for several studies under one bar: what they share is trained once, and none waits for another's end.
 
     Those that share a store must have one budget.
