@@ -17,7 +17,6 @@ from lessons.n06_augmentations import SHOWN, TITLES, augmented, before_and_after
 from lessons.n06_chain import Chain, plain, saving
 from tapip3d_lite.figures.curves import learning_curves
 from tapip3d_lite.lab import make_trainer
-from tapip3d_lite.simulate import simulate_dataset
 from tests import tiny
 
 
@@ -26,12 +25,6 @@ def recipe(**changes):
     return tiny.recipe(
         **({"matching_steps": 2, "steps": 4, "frames": (4, 4), "evaluate_every": 2, "save_every": 100} | changes)
     )
-
-
-@pytest.fixture(scope="module")
-def clips(tmp_path_factory):
-    config = t3d.SimulationConfig(frames=6, size=(32, 32), tracks=24)
-    return simulate_dataset(tmp_path_factory.mktemp("clips"), 2, config, workers=1, progress=False)
 
 
 @pytest.fixture

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import torch
 
+from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.recipe import TrainConfig
 
@@ -35,6 +37,12 @@ SYSTEMS = {
     "SpatialTracker-like": {"space": "uvd", "neighborhood": "planes", "context": "planes", "updater": "temporal"},
 }
 """Switches of the systems that the paper compares."""
+
+
+def untrained(**changes):
+    """A tracker of these sizes, the same one each time."""
+    torch.manual_seed(0)
+    return Tracker(TrackerConfig.preset("lite", **(SIZES | changes))).eval()
 
 
 def recipe(**changes):
