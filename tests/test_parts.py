@@ -26,7 +26,7 @@ from tapip3d_lite.trackers import tracker_runs
 from tapip3d_lite.training.loss import LossConfig, step_loss
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.trainer import Trainer
-from tests.tiny import ROOT, SIZES, recipe, untrained
+from tests.tiny import ROOT, SIZES, command, recipe, untrained
 
 CODE = '''
 from pathlib import Path
@@ -391,7 +391,7 @@ def test_other_code_of_a_part_is_scored_anew(folder):
     assert versions[0] != versions[1]
 
 
-def call(*arguments, cwd):
+def process(*arguments, cwd):
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
         "PYTHONWARNINGS": "error",
@@ -421,17 +421,19 @@ def test_from_file_to_result_by_command_line(folder, clips):
     ]
     run = ["train", "--out", "run", "--data", "data"]
     own = ["--tracker", *words, "context", "my_parts:MyContext", "--loss", "my_parts:my_loss"]
-    result = call(*run, *small, *own, cwd=folder)
+    result = process(*run, *small, *own, cwd=folder)
     assert result.returncode == 0 and "finished" in result.stdout, result.stderr
     weights, clip = Path("run/weights.safetensors"), clips[0]
-    refused = [call("track", clip, "--tracker", weights, cwd=folder), call(*run, "--resume", cwd=folder)]
+    assert "my_parts" not in sys.modules
+    refused = [command("track", clip, "--tracker", weights, cwd=folder), command(*run, "--resume", cwd=folder)]
     for result in refused:
         assert result.returncode == 2 and len(result.stderr.splitlines()) == 1 and "--allow my_parts" in result.stderr
-    result = call("track", clip, "--tracker", weights, "--allow", "my_parts", cwd=folder)
+    assert "my_parts" not in sys.modules
+    result = command("track", clip, "--tracker", weights, "--allow", "my_parts", cwd=folder)
     assert result.returncode == 0 and "points over 8 frames" in result.stdout, result.stderr
-    result = call(*run, "--loss", "paper", "--loss.soften", 2, cwd=folder)
+    result = command(*run, "--loss", "paper", "--loss.soften", 2, cwd=folder)
     assert result.returncode == 2 and "give it or them" in result.stderr
-    result = call(*run[:2], "other", "--tracker", "context", "my_part:A", cwd=folder)
+    result = command(*run[:2], "other", "--tracker", "context", "my_part:A", cwd=folder)
     assert result.returncode == 2 and "module 'my_part' cannot be imported" in result.stderr
 
 

@@ -3,8 +3,6 @@
 import asyncio
 import json
 import signal
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -72,10 +70,10 @@ def test_trainings_have_a_row_each_and_the_command_draws_them(lines, tmp_path):
     texts = [[text.get_text() for text in learning_curve(part).axes[0].texts] for part in (lines, lines[2:])]
     assert texts == [[], ["as it was"]]  # a training that takes its encoder as it finds it
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    command = [sys.executable, "-m", "tapip3d_lite", "curves", "--out", str(tmp_path / "c.png")]
-    subprocess.run([*command, str(tmp_path), str(tmp_path / "log.jsonl")], check=True, cwd=tiny.ROOT)
+    curves = "curves", "--out", tmp_path / "c.png"
+    assert tiny.command(*curves, tmp_path, tmp_path / "log.jsonl").returncode == 0
     assert (tmp_path / "c.png").read_bytes()[:4] == b"\x89PNG"
-    absent = subprocess.run([*command, str(tmp_path / "none")], cwd=tiny.ROOT, capture_output=True, text=True)
+    absent = tiny.command(*curves, tmp_path / "none")
     assert absent.returncode == 2 and "no such log" in absent.stderr
 
 

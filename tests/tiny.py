@@ -1,8 +1,13 @@
 """Tiny sizes, recipes and helpers that several test modules share; fixtures are in conftest."""
 
+import os
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
+from io import StringIO
 from pathlib import Path
+from unittest import mock
 
 import torch
 
@@ -55,6 +60,26 @@ def recipe(**changes):
 def checkpoint(folder):
     """The weights in a training's folder."""
     return torch.load(folder / "checkpoint.pt", weights_only=True)["model"]
+
+
+def command(*arguments, cwd=ROOT, main=None):
+    """A command in this process, which spares the seconds that Python takes to start: exit code and what it printed."""
+    said, words, before = (StringIO(), StringIO()), list(map(str, arguments)), os.getcwd()
+    with (
+        mock.patch.object(sys, "argv", ["tapip3d_lite", *words]),
+        mock.patch.object(sys, "path", [*sys.path]),
+        mock.patch.dict(os.environ, COLUMNS="200"),
+        redirect_stdout(said[0]),
+        redirect_stderr(said[1]),
+    ):
+        os.chdir(cwd)
+        try:
+            code = (main or import_module("tapip3d_lite.__main__").main)() or 0
+        except SystemExit as stopped:
+            code = stopped.code or 0
+        finally:
+            os.chdir(before)
+    return subprocess.CompletedProcess(words, code, *(text.getvalue() for text in said))
 
 
 RUN = """
