@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 import tapip3d_lite as t3d
-from lessons.n10_sources import BASELINE, SHARE, depth_errors, filmed_twice, scattered, sensor, sparse, stereo
+from lessons.n10_sources import BASELINE, SHARE, depth_errors, filmed_twice, sensor, sparse, stereo
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.evaluation.benchmark import show
 from tapip3d_lite.evaluation.evaluate import markdown_table
@@ -30,6 +30,12 @@ METRICS = ("AJ3D", "APD3D")
 ERRORS = ("AbsRel", "within 5 %", "known")  # as `depth_errors` gives them
 
 Source = Callable[[Clip, int], np.ndarray]
+
+
+def scattered(clip: Clip, seed: int) -> np.ndarray:
+    """The pixels that `sparse` knows, without what it spreads."""
+    shown = np.random.default_rng(seed).random(clip.depths.shape) < SHARE
+    return np.where(shown, clip.depths, np.float32(0))
 
 
 def filtered(source: Source) -> Source:

@@ -9,8 +9,9 @@ import numpy as np
 
 from lessons.n10_exercises import STEREO
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.depth import densify_depth, stereo_depth
+from tapip3d_lite.depth import stereo_depth
 from tapip3d_lite.evaluation.lite_splits import split_file
+from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.simulate import render_clip
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade
 from tapip3d_lite.simulate.rollout import Rollout, load_rollouts
@@ -48,15 +49,9 @@ def stereo(clip: Clip, _seed: int) -> np.ndarray:
     return stereo_depth(clip.video, clip.extras["video_right"], clip.intrinsics, BASELINE)
 
 
-def scattered(clip: Clip, seed: int) -> np.ndarray:
-    """True depth of few pixels; of the others none."""
-    shown = np.random.default_rng(seed).random(clip.depths.shape) < SHARE
-    return np.where(shown, clip.depths, np.float32(0))
-
-
 def sparse(clip: Clip, seed: int) -> np.ndarray:
     """True depth of few pixels, spread to their neighbours."""
-    return densify_depth(scattered(clip, seed))
+    return under(clip, {"sparse": SHARE}, seed).depths
 
 
 def depth_errors(depths: np.ndarray, truth: np.ndarray) -> tuple[float, float, float]:
