@@ -1,9 +1,19 @@
 """Fixtures for all test modules; the sizes behind them are in `tiny`."""
 
+import os
+from unittest import mock
+
 import pytest
 import torch
 
 from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_core():
+    """Clips are simulated in this process where nobody asks for workers: each would take seconds to start."""
+    with mock.patch.object(os, "cpu_count", return_value=1):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,7 @@
 """What each source of depth is worth: `python -m tests.depth_sources --tracker lite --clips 8`.
 
 Clips of the Lite benchmark, filmed with a second camera beside the first; their true depth, a sensor's, that of stereo
-matching and that of sparse points, each as it is and filtered: error of the depth, and scores of the tracker on it,
+matching and that of sparse points, as lesson 10 makes them, each as it is and filtered: error of the depth, and scores of the tracker on it,
 paired with those on true depth. Results go to a JSON file, which an interrupted run continues, and a Markdown page.
 """
 
@@ -17,53 +17,40 @@ import numpy as np
 from tqdm import tqdm
 
 import tapip3d_lite as t3d
+from lessons.n10_sources import BASELINE, SHARE, depth_errors, filmed_twice, sensor, sparse, stereo
 from tapip3d_lite.clip import Clip
 from tapip3d_lite.evaluation.benchmark import show
 from tapip3d_lite.evaluation.evaluate import markdown_table
 from tapip3d_lite.evaluation.intervals import bootstrap_interval, paired_difference
 from tapip3d_lite.evaluation.lite_splits import split_file
 from tapip3d_lite.files import write_text
-from tapip3d_lite.simulate import render_clip
-from tapip3d_lite.simulate.degrade import SensorConfig, degrade
 from tapip3d_lite.simulate.rollout import load_rollouts
 
-BASELINE = 0.2  # metres
-SENSOR = SensorConfig(
-    flicker=0.003, noise=0.01, grain=0.002, step=0.001, flying=0.5, shadow=2.0, grazing=5.0, dropout=0.05
-)
-SHARE = 0.02  # of the pixels that the sparse points show
 METRICS = ("AJ3D", "APD3D")
+ERRORS = ("AbsRel", "within 5 %", "known")  # as `depth_errors` gives them
+
+Source = Callable[[Clip, int], np.ndarray]
 
 
-def stereo(clip: Clip, _seed: int) -> np.ndarray:
-    return t3d.stereo_depth(clip.video, clip.extras["video_right"], clip.intrinsics, BASELINE)
-
-
-def sparse(clip: Clip, seed: int) -> np.ndarray:
+def scattered(clip: Clip, seed: int) -> np.ndarray:
+    """The pixels that `sparse` knows, without what it spreads."""
     shown = np.random.default_rng(seed).random(clip.depths.shape) < SHARE
     return np.where(shown, clip.depths, np.float32(0))
 
 
-def filtered(source: Callable[[Clip, int], np.ndarray]) -> Callable[[Clip, int], np.ndarray]:
+def filtered(source: Source) -> Source:
     return lambda clip, seed: t3d.filter_depth(source(clip, seed))
 
 
-SOURCES: dict[str, Callable[[Clip, int], np.ndarray]] = {
+SOURCES: dict[str, Source] = {
     "true": lambda clip, _: clip.depths,
-    "sensor": lambda clip, seed: degrade(clip, SENSOR, seed).depths,
+    "sensor": sensor,
     "stereo": stereo,
-    f"sparse ({SHARE:.0%}), densified": lambda clip, seed: t3d.densify_depth(sparse(clip, seed)),
-    f"sparse ({SHARE:.0%}) as it is": sparse,
+    f"sparse ({SHARE:.0%}), densified": sparse,
+    f"sparse ({SHARE:.0%}) as it is": scattered,
 }
 RAW = list(SOURCES)
 SOURCES |= {f"{name}, filtered": filtered(SOURCES[name]) for name in RAW[:-1]}
-
-
-def errors(depths: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Over the pixels that have both: mean |z - z*| / z*, share within 5 %; and the share of pixels that have depth."""
-    known = (depths > 0) & (truth > 0)
-    error = np.abs(depths[known] / truth[known] - 1)
-    return {"AbsRel": float(error.mean()), "within 5 %": float((error < 0.05).mean()), "known": float(known.mean())}
 
 
 def measure(name: str, split: str, count: int, out: Path) -> dict:
@@ -74,11 +61,12 @@ def measure(name: str, split: str, count: int, out: Path) -> dict:
         todo = [source for source in SOURCES if f"{source} {index}" not in results]
         if not todo:
             continue
-        clip = render_clip(replace(rollout, config=replace(rollout.config, stereo_baseline=BASELINE)))
+        clip = filmed_twice(rollout)
         for source in tqdm(todo, desc="sources", leave=False):
             depths = SOURCES[source](clip, index)
             scores = t3d.evaluate(tracker.track(replace(clip, depths=depths)), clip)
-            results[f"{source} {index}"] = errors(depths, clip.depths) | {m: scores[m] for m in METRICS}
+            results[f"{source} {index}"] = dict(zip(ERRORS, depth_errors(depths, clip.depths), strict=True))
+            results[f"{source} {index}"] |= {m: scores[m] for m in METRICS}
             write_text(out, json.dumps(results, indent=1) + "\n")
     return results
 
@@ -91,11 +79,11 @@ def page(results: dict, name: str, split: str, count: int) -> str:
     for raw in RAW:
         for source in (raw, f"{raw}, filtered"):
             if source in SOURCES:
-                depth = [f"{np.mean(column(source, what)):.3f}" for what in ("AbsRel", "within 5 %", "known")]
+                depth = [f"{np.mean(column(source, what)):.3f}" for what in ERRORS]
                 own = [show(bootstrap_interval(column(source, m))) for m in METRICS]
                 lost = [show(paired_difference(column(source, m), column("true", m)), "+") for m in METRICS]
                 rows.append([source, *depth, *own, *lost])
-    head = ["depth", "AbsRel", "within 5 %", "known", *METRICS, *(f"{m} against true depth" for m in METRICS)]
+    head = ["depth", *ERRORS, *METRICS, *(f"{m} against true depth" for m in METRICS)]
     return f"`{name}` on the first {count} clips of `{split}`, baseline {BASELINE} m:\n\n{markdown_table(head, rows)}\n"
 
 

@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 
 import tapip3d_lite as t3d
+from lessons.n10_measure import SUSPECTS, depth
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.geometry import invert, point_map
+from tapip3d_lite.geometry import invert
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade
 
 SENSOR = SensorConfig(
@@ -27,23 +28,24 @@ SENSOR = SensorConfig(
 FLIP = np.diag([1, -1, -1, 1]).astype(np.float32)
 
 
+def planted(name: str) -> tuple[Callable[[Clip], Clip], str]:
+    """The row of a mistake that lesson 10 plants, too."""
+    return SUSPECTS[name], name
+
+
 def pose(change: Callable) -> Callable[[Clip], Clip]:
     return lambda clip: replace(clip, extrinsics=change(clip.extrinsics))
-
-
-def depth(change: Callable) -> Callable[[Clip], Clip]:
-    return lambda clip: replace(clip, depths=np.where(clip.depths > 0, change(np.maximum(clip.depths, 1e-6)), 0))
 
 
 def lens(change: Callable) -> Callable[[Clip], Clip]:
     """Change (fx, fy, cx, cy) of a clip of size (H, W)."""
 
-    def planted(clip: Clip) -> Clip:
+    def plant(clip: Clip) -> Clip:
         k = clip.intrinsics.copy()
         k[:, [0, 1, 0, 1], [0, 1, 2, 2]] = np.transpose(change(k[:, [0, 1, 0, 1], [0, 1, 2, 2]].T, *clip.size))
         return replace(clip, intrinsics=k)
 
-    return planted
+    return plant
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
@@ -64,12 +66,12 @@ def matrix(q: np.ndarray) -> np.ndarray:
 
 
 def rotations(change: Callable) -> Callable[[np.ndarray], np.ndarray]:
-    def planted(poses: np.ndarray) -> np.ndarray:
+    def plant(poses: np.ndarray) -> np.ndarray:
         poses = poses.copy()
         poses[:, :3, :3] = [change(r) for r in poses[:, :3, :3]]
         return poses
 
-    return planted
+    return plant
 
 
 def travel(poses: np.ndarray, factor: float) -> np.ndarray:
@@ -99,11 +101,11 @@ def drifting(poses: np.ndarray) -> np.ndarray:
 def moved(by: int, *keys: str) -> Callable[[Clip], Clip]:
     """Frame t gets what frame t + `by` has of some arrays."""
 
-    def planted(clip: Clip) -> Clip:
+    def plant(clip: Clip) -> Clip:
         arrays = {key: getattr(clip, key)[:-by] for key in ("video", "depths", "intrinsics", "extrinsics")}
         return replace(clip, extras={}, **(arrays | {key: getattr(clip, key)[by:] for key in keys}))
 
-    return planted
+    return plant
 
 
 def relative(clip: Clip) -> Clip:
@@ -111,20 +113,15 @@ def relative(clip: Clip) -> Clip:
     return replace(clip, depths=clip.depths * factors[:, None, None])
 
 
-def ray_lengths(clip: Clip) -> Clip:
-    rays = point_map(np.ones_like(clip.depths), clip.intrinsics)
-    return replace(clip, depths=clip.depths * np.linalg.norm(rays, axis=-1))
-
-
 def marked(value: float) -> Callable[[Clip], Clip]:
     """A value that stands for unknown: at the pixels without depth, and on the upper eighth of the image."""
 
-    def planted(clip: Clip) -> Clip:
+    def plant(clip: Clip) -> Clip:
         depths = np.where(clip.depths > 0, clip.depths, value)
         depths[:, : clip.size[0] // 8] = value
         return replace(clip, depths=depths)
 
-    return planted
+    return plant
 
 
 def far(clip: Clip) -> Clip:
@@ -134,11 +131,11 @@ def far(clip: Clip) -> Clip:
 
 
 MIX_UPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
-    "camera to world": (pose(invert), "camera_to_world"),
+    "camera to world": planted("camera_to_world"),
     "OpenGL axes": (pose(lambda x: FLIP @ x), "opengl_axes"),
     "both": (pose(lambda x: invert(FLIP @ x)), "camera_to_world+opengl_axes"),
-    "millimetres": (depth(lambda d: d * 1000), "depth_in_millimetres"),
-    "camera to world, millimetres": (lambda c: pose(invert)(depth(lambda d: d * 1000)(c)), "camera_to_world+depth_in_millimetres"),
+    "millimetres": planted("depth_in_millimetres"),
+    "camera to world, millimetres": (lambda c: pose(invert)(SUSPECTS["depth_in_millimetres"](c)), "camera_to_world+depth_in_millimetres"),
     "poses in millimetres": (pose(lambda x: travel(x, 1000)), "poses_in_millimetres"),
     "decimetres": (depth(lambda d: d * 10), "depth_scale"),
     "divided by 5000 for 1000": (depth(lambda d: d / 5), "depth_scale"),
@@ -146,9 +143,9 @@ MIX_UPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
     "relative depth, scaled per clip": (depth(lambda d: 0.37 * d), "depth_scale"),
     "relative depth, scaled per frame": (relative, "depth_scale_per_frame"),
     "relative depth, affine": (depth(lambda d: 0.3 * d + 1), "affine_depth"),
-    "disparity": (depth(lambda d: 1 / d), "disparity"),
+    "disparity": planted("disparity"),
     "disparity, affine": (depth(lambda d: 10 / d + 0.5), "disparity"),
-    "ray length": (ray_lengths, "ray_length"),
+    "ray length": planted("ray_length"),
     "65.535 m for unknown": (marked(65.535), "stand_in_depth"),
     "1e4 for the sky": (marked(1e4), "lie beyond"),
     "65504 for the sky": (marked(65504), "lie beyond"),
@@ -158,7 +155,7 @@ MIX_UPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
     "K transposed": (lambda c: replace(c, intrinsics=c.intrinsics.swapaxes(1, 2)), "transpose it"),
     "K skewed below the diagonal": (lambda c: replace(c, intrinsics=c.intrinsics + 9 * np.eye(3, k=-1, dtype=np.float32)), "transpose it"),
     "K of another size": (lens(lambda k, h, w: 3 * k), "intrinsics_of_another_size"),
-    "focal length 30 % too long": (lens(lambda k, h, w: [1.3 * k[0], 1.3 * k[1], k[2], k[3]]), "focal_length"),
+    "focal length 30 % too long": planted("focal_length"),
     "focal length 30 % too short": (lens(lambda k, h, w: [0.7 * k[0], 0.7 * k[1], k[2], k[3]]), "focal_length"),
     "cx and cy swapped, landscape for portrait": (lens(lambda k, h, w: [k[1], k[0], k[3], k[2]]), "principal_point_swapped"),
     "quaternion order": (pose(rotations(lambda r: matrix(np.roll(quaternion(r), 1)))), "quaternion_order"),
@@ -171,7 +168,7 @@ MIX_UPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
     "one pose dropped": (pose(dropped), "pose_missing"),
     "poses of two frames lost": (pose(lost), "poses_lost"),
     "poses drifting": (pose(drifting), "poses_drift"),
-    "video mirrored": (lambda c: replace(c, video=c.video[:, :, ::-1]), "colour_mirrored"),
+    "video mirrored": planted("colour_mirrored"),
     "video and depth mirrored": (lambda c: replace(c, video=c.video[:, :, ::-1], depths=c.depths[:, :, ::-1]), "clip_mirrored"),
     "colour early by 3 frames": (moved(3, "video"), "colour_shifted_in_time"),
     "depth early by 3 frames": (moved(3, "depths"), "depth_shifted_in_time"),

@@ -16,6 +16,8 @@ import numpy as np
 from tqdm import tqdm
 
 import tapip3d_lite as t3d
+from lessons import n10_measure
+from lessons.n10_exercises import path
 from tapip3d_lite.evaluation.benchmark import benchmark_clips, show
 from tapip3d_lite.evaluation.evaluate import markdown_table
 from tapip3d_lite.evaluation.intervals import bootstrap_interval
@@ -27,22 +29,12 @@ COLUMNS = {"ATE (cm)": 100, "RPE (cm)": 100, "RPE (degrees)": 1}
 
 def centres_apart(found: np.ndarray, truth: np.ndarray) -> float:
     """ATE of cameras (T, 4, 4), world to camera, in units of the scene."""
-    p, q = (invert(x.astype(np.float64))[:, :3, 3] for x in (found, truth))
-    a, b = p - p.mean(0), q - q.mean(0)
-    u, _, v = np.linalg.svd(a.T @ b)
-    turn = v.T @ np.diag([1, 1, np.linalg.det(v.T @ u.T)]) @ u.T  # of Kabsch
-    return float(np.sqrt(((a @ turn.T - b) ** 2).sum(1).mean()))
+    return float(path(*(invert(x.astype(np.float64))[:, :3, 3] for x in (found, truth))))
 
 
 def steps_apart(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     """RPE of cameras (T, 4, 4): length in units of the scene, angle in degrees."""
-    steps = [x[1:] @ invert(x[:-1]) for x in (found.astype(np.float64), truth.astype(np.float64))]
-    wrong = invert(steps[1]) @ steps[0]
-    # From the skew part, since the cosine of a small angle is blind.
-    skew = (wrong[:, :3, :3] - wrong[:, :3, :3].swapaxes(1, 2)) / 2
-    sine = np.sqrt((skew**2).sum((1, 2)) / 2)
-    angle = np.degrees(np.arctan2(sine, (np.trace(wrong[:, :3, :3], axis1=1, axis2=2) - 1) / 2))
-    length = np.linalg.norm(wrong[:, :3, 3], axis=-1)
+    angle, length = n10_measure.steps_apart(found, truth)
     return float(np.sqrt((length**2).mean())), float(np.sqrt((angle**2).mean()))
 
 

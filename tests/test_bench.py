@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,10 +12,11 @@ import torch
 
 from lessons.saved_bytes import SavedBytes
 from tests.bench import parts
+from tests.bench.__main__ import main
 from tests.bench.report import Row, compared, figure, table
 from tests.bench.timing import extra_memory, own_clock, ratios, side_by_side, stages
+from tests.tiny import ROOT, command
 
-ROOT = Path(__file__).resolve().parents[1]
 LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory is read from /proc")
 
 
@@ -222,5 +222,5 @@ def test_command_writes_every_measurement(tmp_path):
     ],
 )
 def test_bad_options_are_one_line_and_exit_code_2(wrong, message):
-    result = bench(*wrong)
+    result = command(*wrong, main=main)
     assert result.returncode == 2 and result.stderr.count("\n") == 1 and message in result.stderr

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,15 +10,15 @@ import torch
 
 import tapip3d_lite as t3d
 from tapip3d_lite.simulate.degrade import wrong_poses
+from tests.tiny import ROOT, command
 
-ROOT = Path(__file__).resolve().parents[1]
 
-
-def call(*arguments, cwd=ROOT):
+def process(*arguments):
+    """A command in a process of its own; `tiny.command` does the same in this one."""
     environment = os.environ | {"COLUMNS": "200", "PYTHONWARNINGS": "error"}
     return subprocess.run(
         [sys.executable, "-m", "tapip3d_lite", *map(str, arguments)],
-        cwd=cwd,
+        cwd=ROOT,
         capture_output=True,
         text=True,
         env=environment,
@@ -35,7 +34,7 @@ def clip_file(tmp_path_factory):
 
 def test_track_writes_result_page_and_picture(clip_file, tmp_path):
     written = ("--out", tmp_path / "o.npz", "--html", tmp_path / "o.html", "--png", tmp_path / "o.png")
-    result = call("track", clip_file, "--tracker", "klt", *written)
+    result = process("track", clip_file, "--tracker", "klt", *written)
     assert result.returncode == 0, result.stderr
     assert "AJ3D" in result.stdout and "20 points over 6 frames" in result.stdout
     tracks = t3d.load_tracks(tmp_path / "o.npz")
@@ -46,7 +45,7 @@ def test_track_writes_result_page_and_picture(clip_file, tmp_path):
 
 
 def test_track_on_a_grid(clip_file):
-    result = call("track", clip_file, "--tracker", "static", "--no-own-queries", "--grid", "5")
+    result = command("track", clip_file, "--tracker", "static", "--no-own-queries", "--grid", "5")
     assert result.returncode == 0, result.stderr
     assert "25 points" in result.stdout and "AJ3D" not in result.stdout
 
@@ -55,14 +54,14 @@ def test_a_steady_clip_is_tracked_better(tmp_path):
     path, scores = tmp_path / "jitters.npz", []
     wrong_poses(t3d.load_clip(ROOT / "data_samples" / "handheld.npz"), 1.0, seed=0, drift=0).save(path)
     for flags in ([], ["--steady"]):
-        result = call("track", path, "--tracker", "static", "--out", tmp_path / "out.npz", *flags)
+        result = command("track", path, "--tracker", "static", "--out", tmp_path / "out.npz", *flags)
         assert result.returncode == 0, result.stderr
         scores.append(t3d.evaluate(t3d.load_tracks(tmp_path / "out.npz"), t3d.load_clip(path))["AJ3D_none"])
     assert scores[1] > scores[0] + 0.1
 
 
 def test_evaluate_prints_a_table_with_means(clip_file):
-    result = call("evaluate", clip_file, "--tracker", "static", "klt")
+    result = command("evaluate", clip_file, "--tracker", "static", "klt")
     assert result.returncode == 0, result.stderr
     lines = result.stdout.strip().splitlines()
     clip = t3d.load_clip(clip_file)
@@ -95,45 +94,51 @@ def test_bad_input_is_one_line_and_exit_code_2(clip_file, tmp_path, arguments, m
     clip = t3d.load_clip(clip_file, points=False)
     clip.save(tmp_path / "plain.npz")
     names = {"CLIP": clip_file, "PLAIN": tmp_path / "plain.npz"}
-    result = call(*(names.get(a, a) for a in arguments), cwd=tmp_path)
+    result = command(*(names.get(a, a) for a in arguments), cwd=tmp_path)
     assert result.returncode == 2
     assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_missing_gpu_is_an_error_before_clips_are_simulated(tmp_path):
-    result = call("train", "--out", tmp_path / "run", "--device", "cuda")
+    result = command("train", "--out", tmp_path / "run", "--device", "cuda")
     assert result.returncode == 2 and "no CUDA device" in result.stderr and "leave --device out" in result.stderr
     assert not (tmp_path / "run").exists()
 
 
 def test_compiling_is_for_a_gpu(tmp_path):
-    result = call("train", "--out", tmp_path / "run", "--compiled")
+    result = command("train", "--out", tmp_path / "run", "--compiled")
     assert result.returncode == 2 and "add --device cuda, or leave --compiled out" in result.stderr
     assert not (tmp_path / "run").exists()
 
 
+def test_processes_exit_with_2():
+    assert process("fly").returncode == 2
+    absent = process("track", "absent.npz")
+    assert absent.returncode == 2 and "no such file" in absent.stderr and absent.stderr.count("\n") == 1
+
+
 def test_usage_errors_also_exit_with_2():
-    assert call("fly").returncode == 2
-    assert call("track").returncode == 2
-    moon = call("simulate", "--out", "x", "--camera", "moon")
+    assert command("fly").returncode == 2
+    assert command("track").returncode == 2
+    moon = command("simulate", "--out", "x", "--camera", "moon")
     assert moon.returncode == 2
     assert "camera" in moon.stderr and "Traceback" not in moon.stderr
 
 
 def test_check_names_the_mix_up(clip_file, tmp_path):
     clip = t3d.load_clip(clip_file)
-    assert "nothing suspicious" in call("check", clip_file).stdout
+    assert "nothing suspicious" in command("check", clip_file).stdout
     arrays = {k: getattr(clip, k) for k in ("video", "depths", "extrinsics")}
     np.savez(tmp_path / "c.npz", **arrays, intrinsics=clip.intrinsics * np.array([[1 / 64], [1 / 48], [1]]))
-    assert "normalised_intrinsics" in call("check", tmp_path / "c.npz").stdout
+    assert "normalised_intrinsics" in command("check", tmp_path / "c.npz").stdout
 
 
 def test_simulate_writes_and_resumes(tmp_path):
     options = ["simulate", "--out", tmp_path, "--frames", "4", "--size", "32", "32", "--tracks", "8", "--workers", "1"]
-    assert call(*options, "--count", "2").returncode == 0
+    assert command(*options, "--count", "2").returncode == 0
     first = sorted(tmp_path.glob("*.npz"))
     before = [p.stat().st_mtime_ns for p in first]
-    assert call(*options, "--count", "3").returncode == 0
+    assert command(*options, "--count", "3").returncode == 0
     assert len(sorted(tmp_path.glob("*.npz"))) == 3
     assert [p.stat().st_mtime_ns for p in first] == before

@@ -11,11 +11,11 @@ from torch import nn
 
 import tapip3d_lite as t3d
 from tapip3d_lite import lab
-from tapip3d_lite.model.n2n import Context
 from tapip3d_lite.model.neighbors import KNearest, Neighbors
 from tapip3d_lite.model.registry import PARTS
 from tapip3d_lite.model.spaces import Camera, World
 from tapip3d_lite.training.loss import FORMS, LossConfig
+from tests import lab_conditions
 from tests.tiny import SIZES
 
 BUILT_IN = [(switch, name) for switch, names in (PARTS | {"loss": FORMS}).items() for name in names]
@@ -30,20 +30,11 @@ def test_every_built_in_part_passes(switch, name):
 # --- one good part of each switch, and ways to break it: a class that inherits from it and breaks one thing ----------
 
 
-class Mean(Context):
+class Mean(lab_conditions.Mean):
     """The query's feature beside the mean of the neighbourhood's."""
 
-    def __init__(self, config):
-        super().__init__()
-        self.width = config.token_dim
-        self.layer = nn.Linear(2 * config.feature_dim, config.token_dim)
-
-    def describe(self, index, support):
-        return support.features[..., 0, :]
-
     def forward(self, index, kept, near):
-        found = near.features.mean(-2)
-        return self.change(self.layer(torch.cat([kept[:, None].expand_as(found), found], -1)), near)
+        return self.change(super().forward(index, kept, near), near)
 
     def change(self, x, near):
         return x

@@ -43,10 +43,13 @@ def test_a_stub_is_not_an_error(name):
 
 
 def test_the_matrix_shows_every_answer_with_its_hint():
-    lines = table()[2:]
-    assert len(lines) == len(EXERCISES) + len(MISTAKES)
-    assert sum("| the reference | passed |" in line for line in lines) == len(EXERCISES)
-    assert sum("| wrong |" in line and "NOT ITS OWN" not in line for line in lines) == len(MISTAKES)
+    """Of one lesson; the two tests above judge the same of all."""
+    some = {name: exercise for name, exercise in EXERCISES.items() if name.startswith("02.")}
+    mistakes = sum(len(exercise.mistakes) for exercise in some.values())
+    lines = table(some)[2:]
+    assert len(lines) == len(some) + mistakes > len(some) >= 3
+    assert sum("| the reference | passed |" in line for line in lines) == len(some)
+    assert sum("| wrong |" in line and "NOT ITS OWN" not in line for line in lines) == mistakes
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 import tapip3d_lite as t3d
 from tapip3d_lite.queries import near_origin
-from tests.tiny import SIZES
+from tests.tiny import untrained
 
 
 @pytest.fixture(scope="module")
@@ -18,10 +18,7 @@ def clip():
 
 @pytest.fixture(scope="module")
 def tracker():
-    import torch
-
-    torch.manual_seed(0)
-    return t3d.Tracker(t3d.TrackerConfig.preset("lite", **SIZES)).eval()
+    return untrained()
 
 
 def moved(clip, offset):

@@ -1,6 +1,7 @@
 """Lesson 06: one path for both devices, films that hide something, what steps can prove, and the milestone."""
 
 import asyncio
+import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 import torch
 
 import tapip3d_lite as t3d
-from lessons import n06, progress
+from lessons import milestone, n06, progress
 from lessons.checker import check
 from lessons.n06_exercises import counted, discounted, update_loss
 from lessons.n06_judge import Ratio
@@ -53,6 +54,8 @@ def test_both_branches_train_by_the_same_functions(branch, tmp_path):
         setting = gpu_setting(1.0, device="cpu")
         assert setting.recipe.precision == "float32" and setting.workers == 0
         setting = small(replace(setting, workers=1), batch=2, tracker=tiny.SIZES, frames=(4, 4), iterations=(2, 2))
+    # Workers import them; here `one_core` simulates.
+    assert all(pickle.loads(pickle.dumps(scene)) is scene for scene in (setting.training, setting.scene))
     paths, held_out = setting.simulate(tmp_path)
     assert len(paths) == 4 and len(held_out) == 2 and len(held_out[0]) == setting.recipe.frames[1]
     assert not ({path.stem for path in paths} & {clip.name for clip in held_out})
@@ -158,8 +161,10 @@ def test_a_function_of_another_form_is_refused(tracker, clip):
         TrackerChain(tracker, batch.frames, batch.queries, batch.truth, LossConfig(), [len] * 3)
 
 
-def test_the_whole_path_is_the_learners(tmp_path):
+def test_the_whole_path_is_the_learners(tmp_path, monkeypatch):
     """What is solved in notebooks 00 to 05 is collected from a folder, and the tracker runs on it."""
+    monkeypatch.setattr(milestone, "_FRAMES", 12)  # two windows in place of three
+    monkeypatch.setattr(milestone, "_library", milestone._tracks)  # not what other tests have kept
     lessons = ("00", "01", "02", "03", "04", "05")
     for path in notebooks():
         if path.stem[:2] in lessons:

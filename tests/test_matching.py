@@ -7,9 +7,7 @@ import torch
 import tapip3d_lite as t3d
 from lessons import n04_votes
 from lessons.n04_votes import paired_bags, similarity_attention, votes
-from tapip3d_lite.model.cloud import feature_cloud
-from tapip3d_lite.model.frames import frames_from_clip
-from tapip3d_lite.model.registry import make_space
+from lessons.n04_world import cloud_of
 
 K = 6
 
@@ -21,10 +19,7 @@ def clip():
 
 @pytest.fixture(scope="module")
 def level(clip):
-    frames = frames_from_clip(clip)
-    points = make_space("world").lift(frames.depths, frames.intrinsics, frames.extrinsics)
-    colors = torch.nn.functional.avg_pool2d(frames.rgb[0], 4)[None]
-    return feature_cloud(colors, points, frames.depths > 0, 1)[0]
+    return cloud_of(clip, stride=4)
 
 
 def by_loop(attention, support, context, width):

@@ -26,7 +26,7 @@ from tapip3d_lite.trackers import tracker_runs
 from tapip3d_lite.training.loss import LossConfig, step_loss
 from tapip3d_lite.training.recipe import TrainConfig
 from tapip3d_lite.training.trainer import Trainer
-from tests.tiny import ROOT, SIZES, recipe
+from tests.tiny import ROOT, SIZES, command, recipe, untrained
 
 CODE = '''
 from pathlib import Path
@@ -126,11 +126,6 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("my_parts", None)
 
 
-def tiny(**changes):
-    torch.manual_seed(0)
-    return t3d.Tracker(t3d.TrackerConfig.preset("lite", **(SIZES | changes))).eval()
-
-
 @pytest.fixture(scope="module")
 def clip():
     return t3d.simulate_clip(seed=1, frames=8, size=(32, 32), tracks=5)
@@ -151,7 +146,7 @@ def test_a_name_and_its_class_are_one(folder):
 
 @pytest.mark.parametrize("switch", OWN)
 def test_saved_and_loaded_only_where_allowed(switch, tmp_path, clip):
-    tracker, path = tiny(**{switch: OWN[switch]}), tmp_path / "w.safetensors"
+    tracker, path = untrained(**{switch: OWN[switch]}), tmp_path / "w.safetensors"
     t3d.save_weights(tracker, path)
     name = f"tests.test_parts:{OWN[switch].__name__}"
     with pytest.raises(
@@ -170,7 +165,7 @@ def test_saved_and_loaded_only_where_allowed(switch, tmp_path, clip):
 
 
 def test_a_file_alone_imports_nothing(folder):
-    tracker = tiny(context="my_parts:MyContext")
+    tracker = untrained(context="my_parts:MyContext")
     t3d.save_weights(tracker, "w.safetensors")
     config = recipe(tracker=SIZES | {"context": "my_parts:MyContext"}, loss="my_parts:my_loss").to_dict()
     sys.modules.pop("my_parts")
@@ -194,7 +189,7 @@ def test_an_allowed_module_does_not_allow_what_it_imports(folder, name):
 
 
 def test_parts_of_a_notebook_are_given_back_or_found_in_their_new_module(folder, tmp_path):
-    tracker = tiny(context=Mine)
+    tracker = untrained(context=Mine)
     values = tracker.config.to_dict() | {"context": "__main__:MyContext"}
     with pytest.raises(
         ValueError, match=r"parts=\[MyContext\], or on the command line by --allow the module that holds"
@@ -257,7 +252,7 @@ def test_names_that_name_nothing(folder, part, message):
 
 @pytest.mark.parametrize("switch", OWN)
 def test_own_parts_track_stream_and_are_recorded(switch, clip):
-    tracker = tiny(**{switch: OWN[switch]})
+    tracker = untrained(**{switch: OWN[switch]})
     tracks = tracker.track(clip, support_grid=2)
     assert np.isfinite(tracks.xyz).all()
     with t3d.Recorder(tracker, columns=[0]) as record:
@@ -280,7 +275,7 @@ def test_the_recorder_shows_no_attention_that_a_users_context_does_not_compute(c
             return 0.5 * super().forward(index, kept, near)
 
     for context, shown in ((Half, False), (type("Same", (N2N,), {}), True)):
-        tracker = tiny(context=context)
+        tracker = untrained(context=context)
         with t3d.Recorder(tracker, columns=[0]) as record:
             tracker.track(clip)
         assert (record.steps[0].levels[0].pool_context is not None) == shown
@@ -291,9 +286,9 @@ def test_functions_as_parts(clip):
         return near.features[..., 0, :4]
 
     with pytest.raises(ValueError, match="attribute width"):
-        tiny(context=looks)
+        untrained(context=looks)
     looks.width = 4
-    assert np.isfinite(tiny(context=looks).track(clip).xyz).all()
+    assert np.isfinite(untrained(context=looks).track(clip).xyz).all()
 
     class Bare(nn.Module):
         """Without a constructor."""
@@ -301,10 +296,10 @@ def test_functions_as_parts(clip):
         def forward(self, tokens, active=None):
             return tokens[..., :4] * 0
 
-    tracks = tiny(updater=Bare, space=Shift).track(clip)
+    tracks = untrained(updater=Bare, space=Shift).track(clip)
     np.testing.assert_allclose(tracks.xyz, np.broadcast_to(clip.queries[:, 1:], tracks.xyz.shape), atol=1e-5)
     with pytest.raises(ValueError, match=r"updater: Mine\(config\) must be made by Mine\(config, inputs\)"):
-        tiny(updater=Mine)
+        untrained(updater=Mine)
 
 
 def test_own_parts_and_loss_are_trained_and_continued(tmp_path, clips, one_thread):
@@ -366,7 +361,7 @@ def test_a_graph_holds_no_part_that_may_wait_for_the_gpu(monkeypatch, caplog):
 
 def test_the_fast_path_says_in_one_line_what_it_leaves(caplog):
     with caplog.at_level(logging.INFO, "tapip3d_lite"):
-        tracker = tiny(context=Mine)
+        tracker = untrained(context=Mine)
         assert [r.getMessage() for r in caplog.records] == ["context: Mine has no fast form and runs as it is written"]
         assert type(tracker.neighborhood).__name__ == "BoxKNearest"  # the other parts stay fast
         t3d.Tracker(tracker.config, fast=False)
@@ -374,8 +369,8 @@ def test_the_fast_path_says_in_one_line_what_it_leaves(caplog):
 
 
 def test_benchmarks_know_own_parts(tmp_path):
-    t3d.save_weights(tiny(context=Mine), tmp_path / "c.safetensors")
-    t3d.save_weights(tiny(space=Shift), tmp_path / "s.safetensors")
+    t3d.save_weights(untrained(context=Mine), tmp_path / "c.safetensors")
+    t3d.save_weights(untrained(space=Shift), tmp_path / "s.safetensors")
     paths = [str(tmp_path / name) for name in ("c.safetensors", "s.safetensors")]
     runs = list(tracker_runs(paths, ["world", "camera"], parts=["tests.test_parts"]))
     assert [(label.rpartition(" · ")[2], options) for label, _, options in runs] == [
@@ -392,11 +387,11 @@ def test_other_code_of_a_part_is_scored_anew(folder):
         (folder / "my_parts.py").write_text(code)
         os.utime(folder / "my_parts.py", (len(versions), len(versions)))
         __import__("linecache").clearcache()
-        versions.append(version_of(tiny(context="my_parts:MyContext"), {}))
+        versions.append(version_of(untrained(context="my_parts:MyContext"), {}))
     assert versions[0] != versions[1]
 
 
-def call(*arguments, cwd):
+def process(*arguments, cwd):
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
         "PYTHONWARNINGS": "error",
@@ -426,17 +421,19 @@ def test_from_file_to_result_by_command_line(folder, clips):
     ]
     run = ["train", "--out", "run", "--data", "data"]
     own = ["--tracker", *words, "context", "my_parts:MyContext", "--loss", "my_parts:my_loss"]
-    result = call(*run, *small, *own, cwd=folder)
+    result = process(*run, *small, *own, cwd=folder)
     assert result.returncode == 0 and "finished" in result.stdout, result.stderr
     weights, clip = Path("run/weights.safetensors"), clips[0]
-    refused = [call("track", clip, "--tracker", weights, cwd=folder), call(*run, "--resume", cwd=folder)]
+    assert "my_parts" not in sys.modules
+    refused = [command("track", clip, "--tracker", weights, cwd=folder), command(*run, "--resume", cwd=folder)]
     for result in refused:
         assert result.returncode == 2 and len(result.stderr.splitlines()) == 1 and "--allow my_parts" in result.stderr
-    result = call("track", clip, "--tracker", weights, "--allow", "my_parts", cwd=folder)
+    assert "my_parts" not in sys.modules
+    result = command("track", clip, "--tracker", weights, "--allow", "my_parts", cwd=folder)
     assert result.returncode == 0 and "points over 8 frames" in result.stdout, result.stderr
-    result = call(*run, "--loss", "paper", "--loss.soften", 2, cwd=folder)
+    result = command(*run, "--loss", "paper", "--loss.soften", 2, cwd=folder)
     assert result.returncode == 2 and "give it or them" in result.stderr
-    result = call(*run[:2], "other", "--tracker", "context", "my_part:A", cwd=folder)
+    result = command(*run[:2], "other", "--tracker", "context", "my_part:A", cwd=folder)
     assert result.returncode == 2 and "module 'my_part' cannot be imported" in result.stderr
 
 

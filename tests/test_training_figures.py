@@ -3,8 +3,6 @@
 import asyncio
 import json
 import signal
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +15,6 @@ from lessons.n06_augmentations import SHOWN, TITLES, augmented, before_and_after
 from lessons.n06_chain import Chain, plain, saving
 from tapip3d_lite.figures.curves import learning_curves
 from tapip3d_lite.lab import make_trainer
-from tapip3d_lite.simulate import simulate_dataset
 from tests import tiny
 
 
@@ -26,12 +23,6 @@ def recipe(**changes):
     return tiny.recipe(
         **({"matching_steps": 2, "steps": 4, "frames": (4, 4), "evaluate_every": 2, "save_every": 100} | changes)
     )
-
-
-@pytest.fixture(scope="module")
-def clips(tmp_path_factory):
-    config = t3d.SimulationConfig(frames=6, size=(32, 32), tracks=24)
-    return simulate_dataset(tmp_path_factory.mktemp("clips"), 2, config, workers=1, progress=False)
 
 
 @pytest.fixture
@@ -83,10 +74,10 @@ def test_trainings_have_a_row_each_and_the_command_draws_them(lines, tmp_path):
     few = [{**lines[2], "step": step, "loss": loss} for step, loss in ((10, 0.4), (20, 0.2), (30, 0.6))]
     assert drawn(learning_curves([("", few)], window=20).axes[0])[1] == ([10, 20, 30], [0.4, 0.3, 0.4])
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    command = [sys.executable, "-m", "tapip3d_lite", "curves", "--out", str(tmp_path / "c.png")]
-    subprocess.run([*command, str(tmp_path), str(tmp_path / "log.jsonl")], check=True, cwd=tiny.ROOT)
+    curves = "curves", "--out", tmp_path / "c.png"
+    assert tiny.command(*curves, tmp_path, tmp_path / "log.jsonl").returncode == 0
     assert (tmp_path / "c.png").read_bytes()[:4] == b"\x89PNG"
-    absent = subprocess.run([*command, str(tmp_path / "none")], cwd=tiny.ROOT, capture_output=True, text=True)
+    absent = tiny.command(*curves, tmp_path / "none")
     assert absent.returncode == 2 and "no such log" in absent.stderr
 
 

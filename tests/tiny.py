@@ -1,11 +1,18 @@
 """Tiny sizes, recipes and helpers that several test modules share; fixtures are in conftest."""
 
+import os
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
+from io import StringIO
 from pathlib import Path
+from unittest import mock
 
 import torch
 
+from tapip3d_lite.model.config import TrackerConfig
+from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.training.data import SamplingConfig
 from tapip3d_lite.training.recipe import TrainConfig
 
@@ -37,6 +44,12 @@ SYSTEMS = {
 """Switches of the systems that the paper compares."""
 
 
+def untrained(**changes):
+    """A tracker of these sizes, the same one each time."""
+    torch.manual_seed(0)
+    return Tracker(TrackerConfig.preset("lite", **(SIZES | changes))).eval()
+
+
 def recipe(**changes):
     """A training of 4 + 12 steps."""
     settings = {"tracker": SIZES, "frames": (4, 6), "sampling": SamplingConfig(tracks=6), "save_every": 3}
@@ -47,6 +60,26 @@ def recipe(**changes):
 def checkpoint(folder):
     """The weights in a training's folder."""
     return torch.load(folder / "checkpoint.pt", weights_only=True)["model"]
+
+
+def command(*arguments, cwd=ROOT, main=None):
+    """A command in this process, which spares the seconds that Python takes to start: exit code and what it printed."""
+    said, words, before = (StringIO(), StringIO()), list(map(str, arguments)), os.getcwd()
+    with (
+        mock.patch.object(sys, "argv", ["tapip3d_lite", *words]),
+        mock.patch.object(sys, "path", [*sys.path]),
+        mock.patch.dict(os.environ, COLUMNS="200"),
+        redirect_stdout(said[0]),
+        redirect_stderr(said[1]),
+    ):
+        os.chdir(cwd)
+        try:
+            code = (main or import_module("tapip3d_lite.__main__").main)() or 0
+        except SystemExit as stopped:
+            code = stopped.code or 0
+        finally:
+            os.chdir(before)
+    return subprocess.CompletedProcess(words, code, *(text.getvalue() for text in said))
 
 
 RUN = """

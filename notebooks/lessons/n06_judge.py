@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,6 +13,7 @@ from lessons.guesses import SHOW, Revealed
 from lessons.guesses import reveal as reveal_known
 from lessons.verdict import Verdict
 from tapip3d_lite.clip import Clip, Tracks
+from tapip3d_lite.lab.conditions import under
 
 _SHOWN = ("video", "depths", "intrinsics", "extrinsics")
 COLORS = ("#000000", "#0072b2", "#e69f00", "#d55e00", "#cc79a7", "#009e73")  # of Okabe and Ito
@@ -20,12 +22,12 @@ MARKS = "osD^vP"
 
 def grey(clip: Clip) -> Clip:
     """Every pixel of the film has one grey: nothing to see, all depths to feel."""
-    return replace(clip, video=np.full_like(clip.video, 127))
+    return under(clip, {"grey": True}, 0)
 
 
 def frozen(clip: Clip, what: Sequence[str] = _SHOWN) -> Clip:
     """Parts of the film stand still at its first frame; by default all of them."""
-    return replace(clip, **{name: np.repeat(getattr(clip, name)[:1], len(clip), 0) for name in what})
+    return reduce(lambda film, part: under(film, {"frozen": part}, 0), what, clip)
 
 
 def errors(tracks: Tracks, clip: Clip, dynamic: bool = True) -> np.ndarray:

@@ -18,6 +18,7 @@ import torch
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.evaluation.evaluate import evaluate, mean_scores
 from tapip3d_lite.formats import load_clip
+from tapip3d_lite.lab.budgets import lab_scene as small_scene
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.simulate import SimulationConfig, simulate_dataset
 from tapip3d_lite.simulate.seeds import TRAINING, VALIDATION
@@ -33,11 +34,6 @@ SMALL = {
     "time_depth": 2, "space_depth": 2, "virtual_tracks": 8,
 }  # fmt: skip
 """The tracker that a CPU trains: the `lite` preset with these sizes."""
-
-
-def small_scene(seed: int) -> SimulationConfig:
-    """Half a second in 64 x 64 pixels; every other clip with a still camera."""
-    return SimulationConfig(frames=12, fps=24.0, size=(64, 64), tracks=192, camera=("static", "arc")[seed % 2])
 
 
 def large_scene(seed: int) -> SimulationConfig:

@@ -48,24 +48,25 @@ def fingerprint(clip: Clip, carry: Callable | None = None) -> dict[str, float]:
     }
 
 
+def depth(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Clip], Clip]:
+    """A mistake that changes depths (T, H, W), where they are known."""
+    return lambda clip: replace(clip, depths=np.where(clip.depths > 0, change(np.maximum(clip.depths, 1e-6)), 0))
+
+
+def _rays(clip: Clip) -> Clip:
+    lengths = np.linalg.norm(point_map(np.ones_like(clip.depths), clip.intrinsics), axis=-1)
+    return replace(clip, depths=clip.depths * lengths)
+
+
 def _longer(clip: Clip) -> Clip:
     return replace(clip, intrinsics=clip.intrinsics * np.float32([[1.3, 1, 1], [1, 1.3, 1], [1, 1, 1]]))
 
 
-def _depths(change: Callable[[Clip], np.ndarray]) -> Callable[[Clip], Clip]:
-    return lambda clip: replace(clip, depths=np.where(clip.depths > 0, change(clip), 0))
-
-
-def _rays(clip: Clip) -> np.ndarray:
-    lengths = np.linalg.norm(point_map(np.ones_like(clip.depths), clip.intrinsics), axis=-1)
-    return clip.depths * lengths
-
-
 SUSPECTS: Mapping[str, Callable[[Clip], Clip]] = {
     "camera_to_world": lambda clip: replace(clip, extrinsics=invert(clip.extrinsics)),
-    "depth_in_millimetres": _depths(lambda clip: clip.depths * 1000),
-    "disparity": _depths(lambda clip: 1 / np.maximum(clip.depths, 1e-6)),
-    "ray_length": _depths(_rays),
+    "depth_in_millimetres": depth(lambda d: d * 1000),
+    "disparity": depth(lambda d: 1 / d),
+    "ray_length": _rays,
     "focal_length": _longer,
     "poses_shifted_in_time": lambda clip: shifted(clip, 3, "extrinsics"),
     "colour_mirrored": lambda clip: replace(clip, video=clip.video[:, :, ::-1]),
@@ -102,7 +103,12 @@ def places(clip: Clip) -> np.ndarray:
 
 def step_errors(clip: Clip, truth: Clip) -> tuple[np.ndarray, np.ndarray]:
     """How far the camera's motion from frame to frame is off: degrees (T - 1,), and metres (T - 1,)."""
-    one, two = (x.extrinsics.astype(np.float64) for x in (clip, truth))
+    return steps_apart(clip.extrinsics, truth.extrinsics)
+
+
+def steps_apart(poses: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`step_errors` of extrinsics (T, 4, 4)."""
+    one, two = (x.astype(np.float64) for x in (poses, truth))
     off = (one[1:] @ invert(one[:-1])) @ invert(two[1:] @ invert(two[:-1]))
     sine = np.linalg.norm(off[:, :3, :3] - np.eye(3), axis=(1, 2)) / 8**0.5  # of half the angle; exact for small ones
     return np.degrees(2 * np.arcsin(np.minimum(sine, 1))), np.linalg.norm(off[:, :3, 3], axis=-1)

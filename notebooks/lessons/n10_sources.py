@@ -9,11 +9,12 @@ import numpy as np
 
 from lessons.n10_exercises import STEREO
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.depth import densify_depth, stereo_depth
+from tapip3d_lite.depth import stereo_depth
 from tapip3d_lite.evaluation.lite_splits import split_file
+from tapip3d_lite.lab.conditions import under
 from tapip3d_lite.simulate import render_clip
 from tapip3d_lite.simulate.degrade import SensorConfig, degrade
-from tapip3d_lite.simulate.rollout import load_rollouts
+from tapip3d_lite.simulate.rollout import Rollout, load_rollouts
 
 BASELINE = 0.2  # metres between the two cameras
 SHARE = 0.02  # of the pixels whose depth the sparse points know
@@ -23,11 +24,16 @@ SENSOR = SensorConfig(
 depth_of = STEREO.reference  # in the milestone the learner's stands here
 
 
+def filmed_twice(rollout: Rollout) -> Clip:
+    """A clip filmed by a second camera `BASELINE` to the right as well."""
+    return render_clip(replace(rollout, config=replace(rollout.config, stereo_baseline=BASELINE)))
+
+
 def benchmark_clips(count: int, frames: int, points: int, split: str = "moving-camera") -> list[Clip]:
     """The first clips of a split of the Lite benchmark, filmed by a second camera `BASELINE` to the right as well."""
     clips = []
     for rollout, _ in load_rollouts(split_file(split))[:count]:
-        clip = render_clip(replace(rollout, config=replace(rollout.config, stereo_baseline=BASELINE))).cut(0, frames)
+        clip = filmed_twice(rollout).cut(0, frames)
         few = np.linspace(0, clip.tracks.xyz.shape[1] - 1, points).astype(int)
         clips.append(replace(clip, tracks=clip.tracks.select(few), queries=None))
     return clips
@@ -45,8 +51,7 @@ def stereo(clip: Clip, _seed: int) -> np.ndarray:
 
 def sparse(clip: Clip, seed: int) -> np.ndarray:
     """True depth of few pixels, spread to their neighbours."""
-    shown = np.random.default_rng(seed).random(clip.depths.shape) < SHARE
-    return densify_depth(np.where(shown, clip.depths, np.float32(0)))
+    return under(clip, {"sparse": SHARE}, seed).depths
 
 
 def depth_errors(depths: np.ndarray, truth: np.ndarray) -> tuple[float, float, float]:
