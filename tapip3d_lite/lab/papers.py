@@ -163,15 +163,15 @@ def open_study(
 
     A file's `folder` and `store` are relative to it; without a `folder` the study is in `runs/<name>`. Custom parts that
     files name must be among `parts`, as for `load_tracker`. Another `budget` (which gets a folder of its own) or number
-    of `seeds` than the study's can be asked for. `shipped`: a table of the paper that has no folder in `runs` yet is the one
-    that the library brings along, to be read, not run.
+    of `seeds` than the study's can be asked for. `shipped`: to be read, not run, so other code is no obstacle, and a table of
+    the paper that has no folder in `runs` yet is the one that the library brings along.
 
     Raises:
         ValueError: neither of these, an unreadable file, unknown fields, or what `Study` refuses.
     """
     path, paper = Path(source), None
     if (path / "study.json").exists():
-        return Study(path, seeds=seeds, budget=budget, accept_code=accept_code, parts=parts), None
+        return Study(path, seeds=seeds, budget=budget, accept_code=accept_code or shipped, parts=parts), None
     if path.suffix not in (".toml", ".json"):
         check_names("lab: no file (.toml, .json), no study's folder, no table of the paper", [str(source)], TABLES)
         values, home = {"store": "runs/store", **TABLES[str(source)]}, Path()
@@ -195,7 +195,7 @@ def open_study(
         kept, folder = {**kept, "budget": budget}, folder.with_name(f"{folder.name}, {budget}")
     if seeds is not None:
         kept["seeds"] = seeds
-    study = Study(folder, rows, **kept, accept_code=accept_code, parts=parts)
+    study = Study(folder, rows, **kept, accept_code=accept_code or shipped, parts=parts)
     study.paper = paper
     return study, values.get("against")
 
