@@ -26,8 +26,9 @@ tracker does ({own:+.1f} AJ3D there, {paper:+.1f} in the paper), so more noise i
 The paper's tracker is one checkpoint for both spaces, trained for both. `lite` is trained in world space alone, and its
 world is sometimes wrong on purpose (`--motion.wrong`). Does that explain it? One more experiment, with two trackers of the
 table `coordinates` on its {clips} clips, seed 0 of each, so that intervals are over clips alone:"""
-END = """At 1° the tracker that was trained for both has {both} AJ3D beside itself in camera space, as in the paper; the one that knows the world alone has {alone}. So the claim speaks of a tracker that has learnt to
-work in the camera's space as well. `python -m tests.disagreements` makes this page."""
+END = """At 1° the tracker that was trained for both stands {both} AJ3D from itself in camera space, below it as in the paper;
+the one that knows the world alone {alone}, which is undecided. So the claim speaks of a tracker that has learnt to work in
+the camera's space as well. `python -m tests.disagreements` makes this page."""
 
 
 def scored() -> Results:
