@@ -581,6 +581,7 @@ def test_tables_run_together_and_train_once_what_they_share(store, tmp_path, mon
         )
     }
     monkeypatch.setattr(papers, "TABLES", tables)
+    monkeypatch.setattr(papers, "PAPER", tmp_path / "nothing is shipped")
     done, do = [], jobs.do
     monkeypatch.setattr(jobs, "do", lambda job, *rest: done.append(job.name) or do(job, *rest))
     monkeypatch.setitem(lab.BUDGETS, "gpu", TINY)
