@@ -51,14 +51,13 @@ class Muon(torch.optim.Muon):
 
     @torch.no_grad()
     def step(self) -> None:
-        """Update the parameters by their gradients, as torch does."""
+        """Update the parameters by their gradients, as torch does with Nesterov's momentum and `match_rms_adamw`."""
         for group in self.param_groups:
             parameters = [p for p in group["params"] if p.grad is not None]
-            gradients, states = [p.grad for p in parameters], [self.state[p] for p in parameters]
-            momenta = [
-                state.setdefault("momentum_buffer", torch.zeros_like(g))
-                for state, g in zip(states, gradients, strict=True)
-            ]
+            gradients = [p.grad for p in parameters]
+            for p in (p for p in parameters if not self.state[p]):
+                self.state[p]["momentum_buffer"] = torch.zeros_like(p)
+            momenta = [self.state[p]["momentum_buffer"] for p in parameters]
             torch._foreach_lerp_(momenta, gradients, 1 - group["momentum"])
             torch._foreach_mul_(parameters, 1 - group["lr"] * group["weight_decay"])
             ahead = torch._foreach_lerp(gradients, momenta, group["momentum"])
