@@ -1,33 +1,49 @@
 """Mutants of the code that must be right: do its tests notice a changed operator, number, argument or statement?
 
-`python -m tests.code_mutants --list` shows how many there are; `python -m tests.code_mutants geometry metrics` runs the
-tests that belong to these files against every mutant (hours for all; `--sample 20` takes as many of each file, with
-`--seed`). A mutant that passes is printed: it is equivalent, and stands with its reason in
-`tests/data/equivalent_mutants/code.json`, or shows a hole in the tests. Mutants live in a copy of the package.
+`python -m tests.code_mutants geometry metrics` runs the tests that belong to these files against every mutant, all files
+without a name (`--list` counts them, `--sample 20` takes as many of each file, with `--seed`). A mutant that passes is
+printed: it is equivalent, and stands with its reason in `tests/data/equivalent_mutants/code.json`, or shows a hole in the
+tests. Each mutant lives in a fork of this process that reads the changed text in place of the file; no file is changed.
 """
 
 import argparse
 import ast
+import importlib
+import io
 import json
 import os
 import random
-import shutil
-import subprocess
+import signal
 import sys
-import tempfile
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
+
+import pytest
+import torch
 
 from tests.mutants import mutants
 
 ROOT = Path(__file__).resolve().parents[1]
+LOADED = [
+    "cv2",
+    "IPython.display",
+    "ipywidgets",
+    "matplotlib.pyplot",
+    "mujoco",
+    "numpy",
+    "plotly.graph_objects",
+    "tyro",
+]
 KNOWN = ROOT / "tests" / "data" / "equivalent_mutants" / "code.json"
-SECONDS = 900  # for the tests of one mutant: an endless loop is noticed, too
+SECONDS = 300  # for the tests of one mutant: an endless loop is noticed, too
 TESTS = {  # file of the library, and the tests that hold it
-    "geometry": ("geometry.py", ["test_geometry.py", "test_clip.py"]),
-    "neighbors": ("model/neighbors.py", ["test_neighborhoods.py", "test_knn.py"]),
-    "n2n": ("model/n2n.py", ["test_model.py", "test_fast.py"]),
-    "loss": ("training/loss.py", ["test_training.py", "test_matching_loss.py"]),
-    "metrics": ("evaluation/metrics.py", ["test_metrics.py"]),
+    "geometry": ("geometry.py", ["geometry", "clip", "poses"]),
+    "neighbors": ("model/neighbors.py", ["neighborhoods", "knn"]),
+    "n2n": ("model/n2n.py", ["model", "fast"]),
+    "loss": ("training/loss.py", ["training", "matching_loss"]),
+    "metrics": ("evaluation/metrics.py", ["metrics"]),
 }
 
 
@@ -45,30 +61,38 @@ def _bare(source: str) -> str:
     return ast.unparse(tree)
 
 
-def passes(name: str, text: str, copy: Path) -> bool:
-    """Whether a file's tests pass with this text in its place, in a copy of the repository."""
-    file, tests = TESTS[name]
-    place = copy / "tapip3d_lite" / file
-    good = place.read_text(encoding="utf-8")
-    place.write_text(text, encoding="utf-8")
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-p",
-        "no:cacheprovider",
-        *(f"tests/{test}" for test in tests),
-    ]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(copy), str(copy / "notebooks")])}
-    try:
-        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, timeout=SECONDS)
-        return done.returncode == 0
-    except subprocess.TimeoutExpired:
-        return False
-    finally:
-        place.write_text(good, encoding="utf-8")
+def passes(name: str, text: str) -> bool:
+    """Whether a file's tests pass with this text in its place."""
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            code = _test(str(ROOT / "tapip3d_lite" / TESTS[name][0]), text, TESTS[name][1])
+        finally:
+            os._exit(int(code != 0))
+    end = time.monotonic() + SECONDS
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return status == 0
+        if time.monotonic() > end:
+            os.kill(child, signal.SIGKILL)
+        time.sleep(0.02)
+
+
+def _test(place: str, text: str, names: list[str]) -> int:
+    """In a fork: run the tests while one file reads as `text`."""
+    read, stats = SourceFileLoader.get_data, SourceFileLoader.path_stats
+    SourceFileLoader.get_data = lambda self, path: text.encode() if path == place else read(self, path)
+    # The compiled form of the good file must not be used, nor the mutant's be kept.
+    SourceFileLoader.path_stats = lambda self, path: {"mtime": -1, "size": 0} if path == place else stats(self, path)
+    sys.dont_write_bytecode = True
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # nbval's imports take longer than these tests
+    torch.set_num_threads(1)
+    tests = [str(ROOT / "tests" / f"test_{name}.py") for name in names]
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        return pytest.main(["-q", "-x", "-p", "no:cacheprovider", *tests])
 
 
 def main() -> int:
@@ -78,25 +102,25 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--list", action="store_true", help="only say how many there are")
     options = parser.parse_args()
+    for module in LOADED:  # what tests need and no mutant changes, once and for all forks
+        importlib.import_module(module)
     known, alive = json.loads(KNOWN.read_text(encoding="utf-8")) if KNOWN.exists() else {}, 0
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "copy"
-        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__"))
-        for name in options.names or TESTS:
-            source = (ROOT / "tapip3d_lite" / TESTS[name][0]).read_text(encoding="utf-8")
-            found = real_mutants(source)
-            print(f"{name}: {len(found)} mutants", flush=True)
-            if options.list:
-                continue
-            if not passes(name, source, copy):
-                print(f"  the tests fail on the code as it is: {' '.join(TESTS[name][1])}")
-                return 2
-            count = min(options.sample or len(found), len(found))
-            for what, text in random.Random(options.seed).sample(found, count):
-                if passes(name, text, copy):
-                    reason = known.get(name, {}).get(what)
-                    alive += reason is None
-                    print(f"  {what}: {reason or 'NOT NOTICED'}", flush=True)
+    for name in options.names or TESTS:
+        source = (ROOT / "tapip3d_lite" / TESTS[name][0]).read_text(encoding="utf-8")
+        found = real_mutants(source)
+        if options.list:
+            print(f"{name}: {len(found)} mutants")
+            continue
+        if not passes(name, source):
+            print(f"  the tests fail on the code as it is: {' '.join(TESTS[name][1])}")
+            return 2
+        chosen = random.Random(options.seed).sample(found, min(options.sample or len(found), len(found)))
+        living = [what for what, text in chosen if passes(name, text)]
+        unknown = [what for what in living if what not in known.get(name, {})]
+        alive += len(unknown)
+        print(f"{name}: {len(chosen)} of {len(found)} mutants, {len(chosen) - len(living)} noticed, {len(unknown)} NOT")
+        for what in living:
+            print(f"  {what}: {known.get(name, {}).get(what, 'NOT NOTICED')}", flush=True)
     return 1 if alive else 0
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
+from lessons.restart import with_lines
 from tapip3d_lite.files import atomic_path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -112,7 +113,7 @@ def main():
         sys.exit(f"no notebook matches {', '.join(chosen)}; there are {', '.join(p.stem for p in notebooks())}")
     for path in paths:
         begun = time.perf_counter()
-        nb = clean(run(nbformat.read(path, as_version=4)))
+        nb = with_lines(clean(run(nbformat.read(path, as_version=4))))
         save(nb, path)
         print(f"{path.name}: {time.perf_counter() - begun:.0f} s, {path.stat().st_size / 1e6:.2f} MB")
 

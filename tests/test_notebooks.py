@@ -11,6 +11,7 @@ import nbformat
 import pytest
 from jupyter_client import BlockingKernelClient
 
+from lessons.restart import RULE, needs, with_lines
 from lessons.teaching import solution_copy, solution_of, tags
 from tests.notebook_tools import FOLDER, ROOT, clean, jupyter_lab, notebooks, run
 
@@ -157,6 +158,35 @@ def test_a_kernel_finds_the_lessons_wherever_lab_is_started(tmp_path, monkeypatc
     assert reply["content"]["user_expressions"]["file"]["data"]["text/plain"] == repr(
         str(FOLDER / "lessons/checker.py")
     )
+
+
+@each_notebook
+def test_each_section_says_what_it_needs(path):
+    nb = read(path)
+    assert with_lines(read(path)) == nb, "run `python3 run.py notebooks`"
+
+
+def test_needs_of_a_small_notebook():
+    cells = [
+        "# 1",
+        "import math",
+        "## 1. A",
+        "a = 1\ndef f(x): return [a + y for y in x]",
+        "text\n\n## B",
+        "b = f([a])",
+    ]
+    cells += ["## 2. C", "for a in [2]: a += math.pi", "## 3. D", "d = [b for b in [1]], a", "## 4. E", "e = b, a"]
+    nb = {"cells": [{"cell_type": "code" if i % 2 else "markdown", "source": s} for i, s in enumerate(cells)]}
+    assert needs(nb) == [set(), set(), {1}, {0}, {0, 3}, {0, 1, 2, 3}]
+    texts = [cell["source"] for cell in with_lines(with_lines(nb))["cells"][::2]]
+    assert texts == [
+        f"# 1\n\n{RULE}",
+        "## 1. A",
+        "text\n\n## B\n\n*Needs section 1.*",
+        "## 2. C",
+        "## 3. D\n\n*Needs section 2.*",
+        "## 4. E\n\n*Needs “B” and sections 1 and 2.*",
+    ]
 
 
 @each_notebook
