@@ -48,17 +48,37 @@ TESTS = {  # file of the library, and the tests that hold it
 
 
 def real_mutants(source: str) -> list[tuple[str, str]]:
-    """The mutants of a file that differ in more than words for readers."""
+    """The mutants of a file that differ in more than words for readers and the order of arguments that have none."""
     return [(what, text) for what, text in mutants(source) if _bare(text) != _bare(source)]
 
 
 def _bare(source: str) -> str:
     tree = ast.parse(source)
     for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            node.values = []
+        if isinstance(node, ast.FunctionDef):
+            node.returns = None
+            for argument in ast.walk(node.args):
+                argument.annotation = None
+        if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in (
+            "max",
+            "min",
+            "maximum",
+            "minimum",
+        ):
+            node.args.sort(key=ast.unparse)
         if isinstance(getattr(node, "body", None), list):
             body = [n for n in node.body if not (isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant))]
             node.body = [n for n in body if not isinstance(n, ast.Pass)] or [ast.Pass()]
     return ast.unparse(tree)
+
+
+def _named(source: str, what: str) -> str:
+    """A mutant by its line's text, which stays when lines move: "scale = a / b: Div -> Mult"."""
+    place, _, change = what.partition(" ")
+    line = int(place.split(":")[0])
+    return f"{source.splitlines()[line - 1].strip() if line else 'module'}: {change}"
 
 
 def passes(name: str, text: str) -> bool:
@@ -115,7 +135,7 @@ def main() -> int:
             print(f"  the tests fail on the code as it is: {' '.join(TESTS[name][1])}")
             return 2
         chosen = random.Random(options.seed).sample(found, min(options.sample or len(found), len(found)))
-        living = [what for what, text in chosen if passes(name, text)]
+        living = [_named(source, what) for what, text in chosen if passes(name, text)]
         unknown = [what for what in living if what not in known.get(name, {})]
         alive += len(unknown)
         print(f"{name}: {len(chosen)} of {len(found)} mutants, {len(chosen) - len(living)} noticed, {len(unknown)} NOT")

@@ -5,9 +5,7 @@ equivalent to the solution, and stands with its reason in `tests/data/equivalent
 """
 
 import ast
-import contextlib
 import copy
-import io
 import json
 import os
 import signal
@@ -18,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from lessons.checker import exercises_of, judge
-from lessons.progress import function_name
-from lessons.teaching import read_notebook, solution_of, stubs, tags
+from lessons.progress import function_name, imports_and_parameters
+from lessons.teaching import read_notebook, solution_of, stubs
 
 ROOT = Path(__file__).resolve().parents[1]
 KNOWN = ROOT / "tests" / "data" / "equivalent_mutants"  # one file for each lesson
@@ -108,10 +106,7 @@ def _imports(notebook):
     space, here = {}, os.getcwd()
     os.chdir(ROOT / "notebooks")
     try:
-        for cell in notebook["cells"]:
-            if cell["cell_type"] == "code" and ("parameters" in tags(cell) or "import " in cell["source"]):
-                with contextlib.redirect_stdout(io.StringIO()):
-                    exec(cell["source"], space)
+        exec(imports_and_parameters(notebook), space)
     finally:
         os.chdir(here)
     return space
@@ -137,7 +132,7 @@ def _passes(exercise, text, name, space, seconds):
 
 def known():
     """Exercise to {change: reason} of mutants that compute the same as the solution."""
-    pages = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(KNOWN.glob("*.json"))]
+    pages = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(KNOWN.glob("[0-9]*.json"))]
     return {exercise: changes for page in pages for exercise, changes in page.items()}
 
 

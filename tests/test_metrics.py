@@ -125,7 +125,9 @@ def test_bad_arguments_are_named():
         ((p, v[:-1], q, w, k), "gt_visible"),
         ((p, v, q, w.astype(float), k), "visible"),
         ((p, v, q, w, k[:2]), "intrinsics"),
+        ((p, v, q, w, np.repeat(k[None], len(p) + 1, 0)), r"intrinsics: expected \(\d, 3, 3\)"),
         ((p, v, q, w, 0 * k), "intrinsics: expected positive"),
+        ((p, v, q, w, np.diag([0.0, 1, 1])), "intrinsics: expected positive"),
         ((p, v, q, w, k, [0] * 99), "queries"),
     ]:
         with pytest.raises(ValueError, match=message):
@@ -153,7 +155,45 @@ def test_points_that_are_not_finite_are_misses(scaling, bad):
         assert scores["APD3D"] == pytest.approx(11 / 12)
 
 
-@pytest.mark.parametrize("queries", [[4, 0], [-1, 0], [0.5, 0], [np.nan, 0], 0, [[[0], [0]]], ["a", "b"], None])
+def test_an_error_of_exactly_the_threshold_is_a_miss():
+    p, seen = np.zeros((1, 5, 3)) + [0, 0, 1], np.ones((1, 5), bool)
+    q = p + np.array(THRESHOLDS)[:, None] * [1.0, 0, 0]  # with a focal length of 1 a pixel is 1 wide
+    in_3d = t3d.tapvid3d_metrics(p, seen, q, seen, np.eye(3), scaling="none")
+    extra = np.zeros((1, 5, 2))  # the 2D metrics leave out the query's frame
+    truth, found = (np.concatenate([extra, x[..., :2]]) for x in (p, q))
+    in_2d = t3d.tapvid2d_metrics(truth, np.ones((2, 5), bool), found, np.ones((2, 5), bool), np.zeros(5))
+    for i, k in enumerate(THRESHOLDS):
+        assert in_3d[f"within_{k}"] == in_2d[f"within_{k}"] == i / 5
+
+
+@pytest.mark.parametrize("scaling", SCALINGS)
+def test_points_at_the_camera_and_truth_without_numbers_raise_no_warning(scaling):
+    p = np.random.default_rng(0).normal(size=(4, 3, 3)) + [0, 0, 4]
+    seen, k, start = np.ones((4, 3), bool), camera_matrix([100, 100, 0, 0]), [0, 1, 2]
+    for place in (slice(None), (3, 0)):
+        q = p.copy()
+        q[place] = 0
+        assert t3d.tapvid3d_metrics(p, seen, q, seen, k, start, scaling)["APD3D"] <= 11 / 12
+    p[:, 0], seen[:, 0] = np.inf, False  # a hidden point whose place nobody knows
+    scores = t3d.tapvid3d_metrics(p, seen, np.abs(p), ~seen, k, start, scaling)
+    assert scores["OA"] == 0
+    t3d.tapvid2d_metrics(p[..., :2], seen, p[..., :2], seen, start)
+    t3d.tapvid2d_metrics(p[..., :2], seen, np.full_like(p[..., :2], 1e200), seen, start)
+
+
+def test_lists_and_whole_numbers_are_scored_as_floats():
+    p, q = np.array([[[0, 0, 9]], [[20, 0, 9]]], np.uint8), np.array([[[1, 0, 9]], [[0, 0, 9]]], np.uint8)
+    seen, k = np.ones((2, 1), bool), np.diag([9.0, 9.0, 1.0])
+    expected = t3d.tapvid3d_metrics(p.astype(float), seen, q.astype(float), seen, k, scaling="none")
+    assert expected["within_16"] == 0.5 and expected["within_1"] == 0  # 20 pixels, and not the 12 of uint8
+    for form in (np.asarray, lambda x: x.tolist()):
+        arguments = (form(x) for x in (p, seen, q, seen, k))
+        assert t3d.tapvid3d_metrics(*arguments, scaling="none") == expected
+
+
+@pytest.mark.parametrize(
+    "queries", [[4, 0], [-1, 0], [0.5, 0], [np.nan, 0], 0, [[[0], [0]]], ["a", "b"], np.zeros((2, 0)), None]
+)
 def test_query_frames_are_checked(queries):
     p, seen = np.ones((4, 2, 3)), np.ones((4, 2), bool)
     with pytest.raises(ValueError, match="queries"):

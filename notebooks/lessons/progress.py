@@ -86,7 +86,7 @@ def reset(*names: str) -> Verdict:
 def collect(folder: str | Path = ".", lessons: tuple[str, ...] = ()) -> Verdict:
     """Take over what was solved in other notebooks: run their exercise cells, and keep each function that passes.
 
-    Only cells tagged `exercise` or `parameters` and cells that import are run, so a function must not need other cells.
+    Only cells tagged `exercise` or `parameters` and imports are run, so a function must not need other cells.
     Save those notebooks first.
 
     Args:
@@ -123,18 +123,23 @@ def function_name(notebook: Notebook, exercise: str) -> str:
     return ""
 
 
+def imports_and_parameters(notebook: Notebook) -> str:
+    """The code that a learner's function may need: every import of a notebook, and the cell of its parameters."""
+    lines = []
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code" and "parameters" in tags(cell):
+            lines.append(cell["source"])
+        elif cell["cell_type"] == "code" and "exercise" not in tags(cell):
+            with contextlib.suppress(SyntaxError):
+                body = ast.parse(cell["source"]).body
+                lines += [ast.unparse(node) for node in body if isinstance(node, ast.Import | ast.ImportFrom)]
+    return "\n".join(lines)
+
+
 def _exercise_cells(notebook: Notebook, name: str) -> dict[str, object]:
     space: dict[str, object] = {}
-    for cell in notebook["cells"]:
-        source = cell["source"]
-        if cell["cell_type"] == "code" and ({"exercise", "parameters"} & set(tags(cell)) or _imports(source)):
-            with contextlib.suppress(Exception), contextlib.redirect_stdout(io.StringIO()):
-                exec(compile(source, name, "exec"), space)
+    stubs = [cell["source"] for cell in notebook["cells"] if "exercise" in tags(cell)]
+    for source in [imports_and_parameters(notebook), *stubs]:
+        with contextlib.suppress(Exception), contextlib.redirect_stdout(io.StringIO()):
+            exec(compile(source, name, "exec"), space)
     return space
-
-
-def _imports(source: str) -> bool:
-    try:
-        return any(isinstance(node, ast.Import | ast.ImportFrom) for node in ast.parse(source).body)
-    except SyntaxError:
-        return False

@@ -92,6 +92,7 @@ def tapvid2d_metrics(
     return _scores(inside, v, w, scored, "2D")
 
 
+@np.errstate(invalid="ignore", over="ignore")
 def scale_factor(p: Array, q: Array, both: Array, start: Array | None, scaling: str) -> Array | float:
     """The factor that multiplies predictions q (T, N, 3) before they are compared with the truth p (T, N, 3).
 
@@ -136,11 +137,10 @@ def _ratio(numerator: int, denominator: int) -> float:
 
 def _norm_ratio(p: Array, q: Array, where: Array, average: Callable[[Array], float]) -> float:
     """Average |p| / average |q|, or NaN without a common visible point, which makes every point a miss."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        norms = [np.maximum(np.linalg.norm(x[where], axis=-1), 1e-6) for x in (p, q)]
-        if any(np.isnan(norm).all() for norm in norms):  # also where there is none
-            return np.nan
-        return float(average(norms[0]) / average(norms[1]))
+    norms = [np.maximum(np.linalg.norm(x[where], axis=-1), 1e-6) for x in (p, q)]
+    if any(np.isnan(norm).all() for norm in norms):  # also where there is none
+        return np.nan
+    return float(average(norms[0]) / average(norms[1]))
 
 
 def _query_frames(queries: Array | None, shape: tuple[int, int]) -> Array | None:
