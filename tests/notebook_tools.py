@@ -1,6 +1,7 @@
 """Run notebooks, store clean outputs: `python3 run.py notebooks [name …]`; start a JupyterLab for tests."""
 
 import argparse
+import copy
 import json
 import os
 import re
@@ -13,11 +14,13 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
-from lessons.restart import with_lines
+from lessons.restart import needed, with_lines
+from lessons.teaching import tags
 from tapip3d_lite.files import atomic_path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "notebooks"
+_ASKS = re.compile(r"\bn\d\d\.(?:check|collect|in_use|milestone|progress)\(")  # for the learner's functions
 _PATHS = re.compile(r"(?:/[\w.\-]+)*/(?:notebooks|data_samples|tapip3d_lite)(?=/|\b)")
 
 
@@ -31,6 +34,17 @@ def run(nb, folder=FOLDER, timeout=1200):
     # The kernel cuts printed text by the clock; joined, it is the same in every run.
     NotebookClient(nb, timeout=timeout, kernel_name="python3", resources=place, coalesce_streams=True).execute()
     return nb
+
+
+def on_the_learners_code(nb):
+    """A copy with the code that rests on the exercises, and what that needs; the rest is the same without solutions."""
+    code = [cell for cell in nb.cells if cell.cell_type == "code"]
+    others = needed([cell.source for cell in code])
+    own = {i for i, cell in enumerate(code) if "exercise" in tags(cell) or _ASKS.search(cell.source)}
+    own |= {i for i, needs in enumerate(others) if needs & own}
+    copied = copy.deepcopy(nb)
+    copied.cells = [code[i] for i in sorted(own.union(*(others[i] for i in own)))]
+    return copied
 
 
 def clean(nb):

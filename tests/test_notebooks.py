@@ -13,7 +13,7 @@ from jupyter_client import BlockingKernelClient
 
 from lessons.restart import RULE, needs, with_lines
 from lessons.teaching import solution_copy, solution_of, tags
-from tests.notebook_tools import FOLDER, ROOT, clean, jupyter_lab, notebooks, run
+from tests.notebook_tools import FOLDER, ROOT, clean, jupyter_lab, notebooks, on_the_learners_code, run
 
 NOTEBOOKS = notebooks()
 CHECK = re.compile(r"n\d\d\.check\(")
@@ -205,7 +205,7 @@ def test_exercises_are_whole(path):
 
 @each_notebook
 def test_solutions_pass(path):
-    nb = run(solution_copy(read(path)))
+    nb = run(on_the_learners_code(solution_copy(read(path))))
     warned = [o.text for _, o in outputs(nb) if o.get("name") == "stderr" and "Warning" in o.text]
     assert not warned, warned[0]  # `clean` would hide it from the stored notebook
     checkers = [c for c in code_cells(nb) if CHECK.match(c.source)]
@@ -249,6 +249,15 @@ def test_a_solution_copy_runs_the_folded_code_and_leaves_the_stub_alone(small):
     del small.cells[2]
     with pytest.raises(ValueError, match="no folded solution"):
         solution_copy(small)
+
+
+def test_only_what_rests_on_an_exercise_is_run_again():
+    sources = ["import math", "a = 1", "def f(x): return x + a", 'n01.check("01.f", f)', "b = a + 1", "c = f(math.pi)"]
+    sources += ["d = [b]", "e = c", 'g = n01.in_use("01.f")', "h = b", "print(h, g(0))"]
+    cells = [nbformat.v4.new_code_cell(source) for source in sources]
+    cells[2].metadata["tags"] = ["exercise"]
+    kept = [cell.source for cell in on_the_learners_code(nbformat.v4.new_notebook(cells=cells)).cells]
+    assert kept == [source for source in sources if source != "d = [b]"]
 
 
 def test_a_stored_scene_and_explorer_leave_their_text(small):

@@ -26,10 +26,17 @@ def sections(nb: Notebook) -> list[range]:
 
 def needs(nb: Notebook) -> list[set[int]]:
     """For each section, the earlier ones (0 is the opening) that must have run: by the names it uses, and those they use."""
+    cells = nb["cells"]
+    return needed(
+        ["\n".join(cells[i]["source"] for i in part if cells[i]["cell_type"] == "code") for part in sections(nb)]
+    )
+
+
+def needed(pieces: list[str]) -> list[set[int]]:
+    """For each piece of code, the earlier ones that made a name which it uses, or which one of these uses."""
     made: dict[str, int] = {}
     found: list[set[int]] = []
-    for number, cells in enumerate(sections(nb)):
-        code = "\n".join(nb["cells"][i]["source"] for i in cells if nb["cells"][i]["cell_type"] == "code")
+    for number, code in enumerate(pieces):
         used, own = _names(compile(code, "<section>", "exec", ast.PyCF_ALLOW_TOP_LEVEL_AWAIT))
         direct = {made[name] for name in used if name in made}
         found.append(direct.union(*(found[other] for other in direct)))
@@ -39,10 +46,10 @@ def needs(nb: Notebook) -> list[set[int]]:
 
 def line(nb: Notebook, number: int) -> str:
     """The sentence of a section; empty where it needs nothing but the opening."""
-    needed = sorted(needs(nb)[number] - {0})
-    if len(needed) == number - 1 > 1:
+    others = sorted(needs(nb)[number] - {0})
+    if len(others) == number - 1 > 1:
         return "*Needs everything above.*"
-    titles = [_title(nb["cells"][sections(nb)[other][0]]) for other in needed]
+    titles = [_title(nb["cells"][sections(nb)[other][0]]) for other in others]
     numbers = [title[1] for title in titles if title[1]]
     parts = [f"“{title[2]}”" for title in titles if not title[1]]
     if numbers:
