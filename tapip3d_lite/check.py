@@ -24,6 +24,7 @@ from tapip3d_lite.queries import near_origin
 
 _GAIN = 0.4  # a fix must leave at most this share of the error, once for each change that it makes
 _NOISE = 0.001  # exact clips stay well below; a mistake that changes less than this does no harm either
+_STILL = 0.06  # of a camera at rest colours hardly change
 _FAR = 100.0  # cameras further from the origin than this, in median depths, cost float32's last digits
 
 
@@ -139,6 +140,11 @@ def _at_rest(clip: Clip) -> list[Finding]:
     if whole[0] == 1 and np.median(known) >= 100:
         fix = depths(lambda x: x * 1e-3)
         return [_found("depth_in_millimetres", fix, "", "share of whole numbers", *whole)]
+    before = agreement(clip)
+    for fix, remark in CATALOGUE["poses_at_rest"].undo(Case(clip)) if before.colour > _STILL else ():
+        after = agreement(fix(clip))
+        if after.usual() and after.colour < _GAIN * before.colour:
+            return [_found("poses_at_rest", fix, remark, *_worst(before, after))]
     return _displaced(clip)
 
 
@@ -175,19 +181,19 @@ def _misfit(clip: Clip) -> list[Finding]:
     """The simplest fixes that make an inconsistent clip consistent; where there are none, that it is inconsistent."""
     memory = {}
     before = agreement(clip, memory=memory)
-    if before.usual() and before.depth < _NOISE:
+    if before.depth < _NOISE and before.colour < _STILL:
         return _displaced(clip)
 
     def accepted(attempts: list, slack: float, share: float) -> list[Finding]:
         """What is done in the best attempt, if the clip fits then, and much better."""
         _, after, chain = attempts[0] if attempts else (0, before, [])
         # Where nothing need be wrong, one of many rare mistakes undone helps by chance.
-        many = 1.7 if before.usual() and any(CATALOGUE[step[0]].price > 1 for step in chain) else 1
+        many = 1.3 if before.usual() and any(CATALOGUE[step[0]].price > 1 for step in chain) else 1
         better = before.badness() - after.badness() > -many * max(len(chain), 1) * np.log(share)
         return [_found(*step, *_worst(before, after)) for step in chain] if better and after.usual(slack) else []
 
     tried = []
-    for prices in ((1, 1.1),) if before.usual() else ((1, 2), (2.1, 3)):  # the dear ones only where they are needed
+    for prices in ((1, 1.35),) if before.usual() else ((1, 2), (2.1, 3)):  # the dear ones only where they are needed
         attempts = sorted(_attempts(clip, prices, memory), key=lambda attempt: attempt[0])
         if found := accepted(attempts, 1.0, _GAIN):
             return found

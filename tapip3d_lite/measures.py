@@ -73,9 +73,11 @@ def agreement(clip: Clip, starts: int = 4, count: int = 400, memory: dict | None
         inverse = smooth_inverse(clip.depths[t])
         known[t] = inverse, *np.nonzero(np.isfinite(inverse))
         image[t] = cv2.GaussianBlur(clip.video[t], (0, 0), 1).astype(np.float32)
+    if frames == 1 or sum(len(x[1]) for x in known.values()) < 0.05 * len(known) * clip.depths[0].size:
+        return Agreement(0.0, 0.0)  # points without surfaces between them are no evidence
     rows = [_carry(clip, pair, known, image, rng, count) for pair in pairs]
     if not sum(map(len, rows)):
-        return Agreement(0.0, 0.0) if frames == 1 else Agreement(_CAP, 1.0)
+        return Agreement(_CAP, 1.0)
     depth, colour, other = np.concatenate(rows).T
     usual = np.quantile(other, 0.25)  # of two pixels that have nothing to do with each other
     steps = [row[:, 1] for pair in near if len(row := _carry(clip, pair, known, image, rng, count // 2)) > 20]

@@ -203,13 +203,16 @@ def _scaled_frames(case: Case) -> Candidates:
 
 def _affine(case: Case) -> Candidates:
     a, b = line(*case.triangles[1:])
-    yield depths(lambda x: np.maximum(a * x + b, 0)), f"z = {a:.4g} d + {b:.4g}"
+    known = case.clip.depths[case.clip.depths > 0]
+    if abs(b) < 4 * a * np.median(known):  # else little is left of what was given
+        yield depths(lambda x: np.maximum(a * x + b, 0)), f"z = {a:.4g} d + {b:.4g}"
 
 
 def _inverse(case: Case) -> Candidates:
     _, d, z = case.triangles
     for a, b in ((float(np.median(1 / (z * d))) if len(d) else 1.0, 0.0), line(d, 1 / z)):
-        yield depths(lambda x, a=a, b=b: np.where(a * x + b > 0, 1 / (a * x + b), 0)), f"1 / z = {a:.4g} d + {b:.4g}"
+        if a > 0:  # the farther, the smaller
+            yield depths(lambda x, a=a, b=b: np.where(a * x + b > 0, 1 / (a * x + b), 0)), f"1 / z = {a:.4g} d + {b:.4g}"
 
 
 def _focal(case: Case) -> Candidates:
@@ -282,6 +285,7 @@ CATALOGUE = {
         ("poses_lost", "the camera's tracking was lost in some frames", "Leave these frames out, or use estimate_poses.", _estimated("lost"), 2.2),
         ("poses_drift", "poses drift or jitter against what the images show", "Use estimate_poses, or steady_clip for jitter.", _estimated("drift"), 2.8),
         ("colour_mirrored", "the video is mirrored, depth and poses are not", "Mirror the images back.", _always(lambda c: rebuilt(c, video=c.video[:, :, ::-1]), lambda c: rebuilt(c, video=c.video[:, ::-1]))),
+        ("poses_at_rest", "the poses say that the camera rests, but what rests moves in the images", "Give the camera's poses, or use estimate_poses.", _estimated("drift"), 4),
         ("clip_mirrored", "video and depth are mirrored, the cameras are not", "Mirror both back.", _always(lambda c: rebuilt(c, video=c.video[:, :, ::-1], depths=c.depths[:, :, ::-1]))),
         ("colour_shifted_in_time", "colour and depth are of different instants", _SAME_SENSOR, _late("video"), 1.1),
         ("depth_shifted_in_time", "depth is of other instants than colour and poses", _SAME_SENSOR, _late("depths"), 1.1),
