@@ -96,7 +96,7 @@ def run_lab(*arguments: str) -> int:
 
 
 def run_test(*arguments: str) -> int:
-    os.environ.setdefault("TAPIP3D_MINUTES", "0.4")  # how long notebook 06 trains
+    os.environ.setdefault("TAPIP3D_MINUTES", "0.2")  # how long notebook 06 trains
     os.environ.setdefault("TAPIP3D_STEPS", "20")  # and for how many steps each row of notebook 09
     if "--browser" in arguments:
         # Its driver of 165 MB is only for those who ask; without it the test says that it is skipped.

@@ -22,7 +22,7 @@ from tyro.conf import Positional, arg
 import tapip3d_lite as t3d
 from tapip3d_lite.evaluation.benchmark import ALL, METRICS, SPLITS, run_benchmark, summary_table
 from tapip3d_lite.evaluation.evaluate import mean_scores, score_table
-from tapip3d_lite.export import WRITERS
+from tapip3d_lite.export import check_export
 from tapip3d_lite.files import check_suffix, write_text
 from tapip3d_lite.formats import FORMATS
 from tapip3d_lite.lab.card import model_card
@@ -58,9 +58,10 @@ def track(
     allow: Allowed = (),
 ) -> None:
     """Track the points of a clip in 3D."""
-    for path, allowed in (*((path, WRITERS) for path in out), (html, (".html",)), (png, (".png",))):
+    checks = [(check_export, path) for path in out]  # before the work, not after it
+    for may_write, path, *suffix in (*checks, (check_suffix, html, ".html"), (check_suffix, png, ".png")):
         if path:
-            check_suffix(path, *allowed)  # before the work, not after it
+            may_write(path, *suffix)
     loaded = t3d.load_clip(clip, format)
     queries, note = points.of(loaded)
     own, given = queries is loaded.queries, replace(loaded, queries=queries)
@@ -115,6 +116,9 @@ def benchmark(
     allow: Allowed = (),
 ) -> None:
     """Score trackers on the Lite benchmark; prints Markdown tables with 95 % bootstrap intervals over clips."""
+    if not (tracker and split and space):
+        raise ValueError("benchmark: name at least one tracker, one split and one space")
+    check_suffix(figure or "scores.png", ".png")
     results = run_benchmark(tracker_runs(tracker, space, device, allow), split, count, out)
     for part in ("", "_dynamic", "_static"):
         print(summary_table(results, tuple(metric + part for metric in METRICS), split) + "\n")
@@ -278,7 +282,7 @@ COMMANDS = {function.__name__.rstrip("_"): function for function in _FUNCTIONS}
 def _train(arguments: list[str]) -> Callable[..., None]:
     """`train` with the defaults of the recipe that `--preset` names."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--preset", default="lite")
+    parser.add_argument("--preset", default="lite", nargs="?", const="")
     return partial(later(train), config=TrainConfig.recipe(parser.parse_known_args(arguments)[0].preset))
 
 

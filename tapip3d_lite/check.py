@@ -143,7 +143,7 @@ def _at_rest(clip: Clip) -> list[Finding]:
     before = agreement(clip)
     for fix, remark in CATALOGUE["poses_at_rest"].undo(Case(clip)) if before.colour > _STILL else ():
         after = agreement(fix(clip))
-        if after.usual() and after.colour < _GAIN * before.colour:
+        if after.usual() and after.colour < 0.5 * before.colour:
             return [_found("poses_at_rest", fix, remark, *_worst(before, after))]
     return _displaced(clip)
 
@@ -184,9 +184,17 @@ def _misfit(clip: Clip) -> list[Finding]:
     if before.depth < _NOISE and before.colour < _STILL:
         return _displaced(clip)
 
+    def silhouettes(attempt: tuple[float, Agreement, _Chain]) -> float:
+        """Of those that fit alike: how clearly the depth's edges are the colours' own."""
+        agree = edges(_applied(clip, attempt[2]))
+        return float(agree[len(agree) // 2])
+
     def accepted(attempts: list, slack: float, share: float) -> list[Finding]:
         """What is done in the best attempt, if the clip fits then, and much better."""
-        _, after, chain = attempts[0] if attempts else (0, before, [])
+        best = attempts[0] if attempts else (0, before, [])
+        for other in (x for x in attempts[1:] if x[0] < best[0] + 0.3):
+            best = other if silhouettes(other) > 1.1 * silhouettes(best) else best
+        _, after, chain = best
         # Where nothing need be wrong, one of many rare mistakes undone helps by chance.
         many = 1.3 if before.usual() and any(CATALOGUE[step[0]].price > 1 for step in chain) else 1
         better = before.badness() - after.badness() > -many * max(len(chain), 1) * np.log(share)

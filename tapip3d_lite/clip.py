@@ -58,6 +58,7 @@ class Tracks:
         dynamic = None if self.dynamic is None else self.dynamic[which]
         return Tracks(self.xyz[:, which], self.visible[:, which], self.queries[which], logits, dynamic)
 
+    @checked
     def save(self, path: str | Path, clip: Clip | None = None) -> None:
         """Write the authors' result npz atomically; with the clip, everything that their viewer needs."""
         arrays = {"coords": self.xyz, "visibs": self.visible, "query_points": self.queries}

@@ -47,6 +47,8 @@ def stereo_depth(
         raise ValueError(f"baseline: expected a positive distance in scene units, got {baseline}")
     shape = (3, 3) if np.ndim(intrinsics) == 2 else (len(left), 3, 3)
     focal = np.broadcast_to(floats("intrinsics", intrinsics, shape, finite=True)[..., 0, 0], len(left))
+    if not (focal > 0).all():
+        raise ValueError(f"intrinsics: the focal length must be positive, got {focal.min():g} pixels")
     # A 16th of a pixel is too coarse for small images. The scale is odd: middles of blocks are the old pixels' centres.
     scale = 1 + 2 * max(0, math.ceil(192 / left.shape[2] - 0.5))
     gray = [[cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images] for images in (left, right)]
@@ -164,14 +166,15 @@ def register_depth(
     """Depth (h, w) of one camera as the colour camera beside it sees it: (H, W), 0 where nothing was measured.
 
     X_color = color_from_depth X_depth, rounded to pixels; of several points that meet in one, the nearest counts.
-    A depth camera of fewer pixels than the image is enlarged first, so that its pixels leave no holes.
+    Depth images whose pixels see more than the colour camera's are enlarged first, so that they leave no holes.
     """
     depth = floats("depth", depth, (None, None))
     floats("color_from_depth", color_from_depth, (4, 4), finite=True)
     for name, camera in (("depth_intrinsics", depth_intrinsics), ("intrinsics", intrinsics)):
         floats(name, camera, (3, 3), finite=True)
-    if depth.shape[0] < size[0]:
-        larger = tuple(math.ceil(size[0] / depth.shape[0]) * n for n in depth.shape)
+    scale = math.ceil(intrinsics[0, 0] / depth_intrinsics[0, 0] - 0.05) if depth.size else 1
+    if scale > 1:
+        larger = tuple(scale * n for n in depth.shape)
         depth_intrinsics = resize_intrinsics(depth_intrinsics, depth.shape, larger)
         depth = cv2.resize(depth, larger[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     known = depth > 0

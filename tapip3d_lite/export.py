@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures.flat import check_drawable, track_colors
-from tapip3d_lite.files import atomic_path, check_suffix
+from tapip3d_lite.files import atomic_path, check_suffix, for_opencv
 from tapip3d_lite.geometry import invert, point_map, project, transform
 
 _TAIL = 8  # frames
@@ -34,10 +35,21 @@ def export_tracks(tracks: Tracks, path: str | Path, clip: Clip) -> None:
         ValueError: another suffix, tracks of another length than the clip's, a package that is not installed, or OpenCV
             cannot write the film.
     """
-    write = WRITERS[check_suffix(path, *WRITERS)]
+    write = WRITERS[check_export(path)]
     check_drawable(clip, tracks)
     with atomic_path(path) as temporary:
         write(tracks, temporary, clip)
+
+
+def check_export(path: str | Path) -> str:
+    """The suffix of a file to write; ValueError where it is unknown, its package is missing, or nothing can be written there."""
+    suffix, parent = check_suffix(path, *WRITERS), Path(path).resolve().parent
+    for kind, package in ((".glb", ("trimesh", "trimesh")), (".rrd", ("rerun", "rerun-sdk"))):
+        if suffix == kind:
+            _extra(*package)
+    if parent.exists() and not (parent.is_dir() and os.access(parent, os.W_OK)):
+        raise ValueError(f"{path}: {parent} is no folder in which files can be written; choose another")
+    return suffix
 
 
 def _csv(tracks: Tracks, path: Path, clip: Clip) -> None:
@@ -92,7 +104,7 @@ def overlay(tracks: Tracks, clip: Clip) -> np.ndarray:
 def _mp4(tracks: Tracks, path: Path, clip: Clip) -> None:
     film = overlay(tracks, clip)
     film = film[:, : film.shape[1] // 2 * 2, : film.shape[2] // 2 * 2]  # the codec wants even sizes
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), clip.fps, film.shape[2:0:-1])
+    writer = cv2.VideoWriter(for_opencv(path), cv2.VideoWriter_fourcc(*"mp4v"), clip.fps, film.shape[2:0:-1])
     if not writer.isOpened():
         raise ValueError(f"{path}: this OpenCV writes no MP4; choose .gif")
     for image in film:
@@ -103,8 +115,8 @@ def _mp4(tracks: Tracks, path: Path, clip: Clip) -> None:
 def _gif(tracks: Tracks, path: Path, clip: Clip) -> None:
     film = cv2.Animation()
     film.frames = [np.ascontiguousarray(image[..., ::-1]) for image in overlay(tracks, clip)]
-    film.durations = [round(1000 / clip.fps)] * len(clip)
-    if not cv2.imwriteanimation(str(path), film):
+    film.durations = [max(round(1000 / clip.fps), 20)] * len(clip)  # browsers slow down what is faster
+    if not cv2.imwriteanimation(for_opencv(path), film):
         raise ValueError(f"{path}: this OpenCV writes no GIF; choose .mp4")
 
 

@@ -88,6 +88,21 @@ def locked(path: str | Path, what: str) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
+def regular(path: str | Path) -> Path:
+    """The path of a regular file; ValueError for a device or a pipe, of which no end is known, and where there is none."""
+    if not Path(path).is_file():
+        raise ValueError(f"{path}: no such file, or a folder, a device or a pipe; check the path")
+    return Path(path)
+
+
+def for_opencv(path: str | Path) -> str:
+    """A path as text; ValueError where it is no UTF-8, of which OpenCV dies."""
+    try:
+        return str(path).encode() and str(path)
+    except UnicodeEncodeError:
+        raise ValueError(f"{path!r}: this name is no UTF-8, which OpenCV needs; rename it") from None
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file (UTF-8) atomically."""
     with atomic_path(path) as temporary:
@@ -97,7 +112,7 @@ def write_text(path: str | Path, text: str) -> None:
 def read_json(path: str | Path, make: Callable[[dict], T] = dict) -> T:
     """What `make` makes of the dictionary in a JSON file; an unreadable file, or one that it cannot use, is a ValueError."""
     try:
-        return make(json.loads(Path(path).read_text(encoding="utf-8")))
+        return make(json.loads(regular(path).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
         raise ValueError(f"{path}: not a readable JSON file ({error}); repair it, or choose another") from error
 
@@ -110,11 +125,8 @@ def load_npz(
     Memory is taken only for what the file's length and each array's header agree upon. Arrays of `objects` are pickles,
     and read as `load_objects` does.
     """
-    if not Path(path).exists():
-        raise ValueError(f"{path}: no such file; check the path")
+    regular(path)
     try:
-        if not Path(path).is_file():
-            raise ValueError("a folder or a device")
         with open(path, "rb") as file:
             archive, arrays = Archive(file), {}
             for member, size in archive.sizes.items():
@@ -135,7 +147,7 @@ def load_npz(
 def npz_keys(path: str | Path) -> set[str]:
     """The names of an npz file's arrays; none where it is no readable one."""
     try:
-        with open(path, "rb") as file:
+        with open(regular(path), "rb") as file:
             return {name.removesuffix(".npy") for name in Archive(file).sizes}
     except (ValueError, OSError):
         return set()

@@ -212,7 +212,10 @@ def _inverse(case: Case) -> Candidates:
     _, d, z = case.triangles
     for a, b in ((float(np.median(1 / (z * d))) if len(d) else 1.0, 0.0), line(d, 1 / z)):
         if a > 0:  # the farther, the smaller
-            yield depths(lambda x, a=a, b=b: np.where(a * x + b > 0, 1 / (a * x + b), 0)), f"1 / z = {a:.4g} d + {b:.4g}"
+            yield (
+                depths(lambda x, a=a, b=b: np.where(a * x + b > 0, 1 / (a * x + b), 0)),
+                f"1 / z = {a:.4g} d + {b:.4g}",
+            )
 
 
 def _focal(case: Case) -> Candidates:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 
 from tapip3d_lite.clip import Clip, check_queries, query_frames
+from tapip3d_lite.files import regular
 from tapip3d_lite.geometry import pixel_grid, unproject
 from tapip3d_lite.validate import bools, floats
 
@@ -78,8 +80,10 @@ def grid_queries(clip: Clip, side: int = 16, frame: int = 0, margin: float = 1 /
 
 def support_queries(clip: Clip, side: int, frame: int = 0, margin: float = 1 / 64) -> np.ndarray:
     """`grid_queries`, or no rows at all where no node has depth: points that only help others may be missing."""
-    if side < 1 or not 0 <= frame < len(clip):
-        raise ValueError(f"grid_queries: expected side >= 1, a frame in [0, {len(clip) - 1}], got {side=}, {frame=}")
+    if not 1 <= side <= 2**12 or not 0 <= frame < len(clip):
+        raise ValueError(
+            f"grid_queries: expected side in [1, 4096], a frame in [0, {len(clip) - 1}], got {side=}, {frame=}"
+        )
     height, width = clip.size
     inset = [min(width * margin, (length - 1) / 2) for length in (width, height)]
     u, v = (np.linspace(x, length - x, side) for x, length in zip(inset, (width, height), strict=True))
@@ -103,6 +107,8 @@ def dense_queries(clip: Clip, frame: int = 0, mask: np.ndarray | None = None, st
     chosen[step // 2 :: step, step // 2 :: step] = True
     if mask is not None:
         chosen &= bools("mask", mask, clip.size)
+    if not chosen.any():
+        raise ValueError(f"queries: none left, since the mask is empty at every {step}. row and column; give another")
     uv = pixel_grid(*clip.size, like=np.zeros(0, np.float32))[chosen]
     pixels = np.concatenate([np.full((len(uv), 1), frame, np.float32), uv], 1)
     return _some(_lifted(clip, pixels, clip.depths[frame][chosen]), clip, frame, f"any of the {len(uv)} pixels chosen")
@@ -127,13 +133,13 @@ def resolve_queries(clip: Clip, queries: np.ndarray | None, grid: int = 16) -> n
 
 @dataclass(frozen=True)
 class QueryChoice:
-    """Which points to track, as the command line asks it: the first of these that is given.
+    """Which points to track, as the command line asks it: at most one of the first three.
 
     Attributes:
         pixels: text file with a query a line: frame, u, v.
         mask: image in which the pixels to track are not black.
         dense: track every pixel of a frame that has depth.
-        own_queries: use the clip's own queries where it has some.
+        own_queries: use the clip's own queries where it has some and no other grid or frame is asked for.
         grid: queries on a frame, side x side.
         frame: where grid, mask and dense queries are asked.
         step: of mask and dense queries take every so many rows and columns.
@@ -151,21 +157,26 @@ class QueryChoice:
 
     def of(self, clip: Clip) -> tuple[np.ndarray, str]:
         """The rows (t, x, y, z) on a clip, and in words which lines were skipped; ValueError also for unreadable files."""
+        if (self.pixels is not None) + (self.mask is not None) + self.dense > 1:
+            raise ValueError("queries: give one of --pixels, --mask and --dense")
         if self.pixels is not None:
             try:
-                rows = np.loadtxt(self.pixels, np.float32, delimiter=",", ndmin=2, encoding="utf-8")
-            except (OSError, ValueError) as error:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("error")  # of an empty file
+                    rows = np.loadtxt(regular(self.pixels), np.float32, delimiter=",", ndmin=2, encoding="utf-8")
+            except (OSError, ValueError, UserWarning) as error:
                 raise ValueError(f"{self.pixels}: expected lines of numbers, frame,u,v ({error})") from None
             queries, lost = queries_from_pixels(clip, rows, self.on_invalid), np.flatnonzero(~has_depth(clip, rows))
             return queries, f"; rows {lost.tolist()} on invalid depth skipped" if len(lost) else ""
         if self.mask is not None:
-            image = cv2.imread(str(self.mask), cv2.IMREAD_GRAYSCALE) if self.mask.is_file() else None
+            data = np.fromfile(self.mask, np.uint8) if self.mask.is_file() else np.zeros(0)
+            image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
             if image is None:
                 raise ValueError(f"{self.mask}: not a readable image; expected a mask, black where not to track")
             return dense_queries(clip, self.frame, image > 0, self.step), ""
         if self.dense:
             return dense_queries(clip, self.frame, step=self.step), ""
-        own = self.own_queries and clip.queries is not None
+        own = self.own_queries and clip.queries is not None and (self.grid, self.frame) == (16, 0)
         return clip.queries if own else grid_queries(clip, self.grid, self.frame), ""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import lzma
+import os
 import re
 import sys
 import zlib
@@ -13,17 +14,26 @@ from concurrent.futures import BrokenExecutor
 from functools import wraps
 from typing import Any
 
+import cv2
+
 _EXPECTED = (ValueError, ArithmeticError, OSError, EOFError, RuntimeError, MemoryError, zlib.error, lzma.LZMAError)
 
 
 @contextlib.contextmanager
 def refusals() -> Iterator[None]:
     """Turn what may go wrong in a command into one line and an exit code; `python -X dev` shows where it went wrong."""
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what OpenCV cannot read, we say
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")  # a terminal without "·" shows the rest
     try:
         yield
     except KeyboardInterrupt:
         _leave("interrupted; what was finished is kept", 130)
     except _EXPECTED as error:
+        if isinstance(error.__context__, KeyboardInterrupt):  # it came while a file was written
+            _leave("interrupted; what was finished is kept", 130)
         if sys.flags.dev_mode:
             raise
         _leave(f"error: {reason(error)}", 1 if isinstance(error, BrokenExecutor) else 2)

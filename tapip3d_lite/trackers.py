@@ -82,8 +82,10 @@ def track_many(
     Tracks of one block help one another, those of two do not. Arguments and errors are those of `track`; `progress`
     shows a bar.
     """
-    if block < 1:
-        raise ValueError(f"track_many: block must be at least 1, got {block}")
+    if block < 1 or not callable(getattr(tracker, "track", None)):
+        raise ValueError(
+            f"track_many: expected a tracker and a block of at least 1, got {type(tracker).__name__}, {block}"
+        )
     queries = resolve_queries(clip, queries)
     starts = range(0, max(len(queries), 1), block)
     options["progress"] = progress and len(starts) == 1

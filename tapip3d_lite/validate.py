@@ -24,7 +24,7 @@ _PLAUSIBLE = 1000.0  # times the lower decile of the depths
 
 def video_frames(video: np.ndarray, name: str = "Clip.video") -> np.ndarray:
     """A video (T, H, W, 3) uint8 with at least one frame, or ValueError."""
-    video = _array(name, video)
+    video = as_array(name, video)
     if video.ndim != 4 or video.shape[-1] != 3 or video.dtype != np.uint8:
         raise ValueError(
             f"{name}: expected (T, H, W, 3) uint8 RGB, got {video.shape} {video.dtype}; move the colour axis last, drop alpha, scale [0, 1] floats by 255"
@@ -74,11 +74,20 @@ def check_about(clip: Any, taken: Collection[str]) -> None:
     """Raise ValueError unless a clip's name, frame rate and tracks are such, and its further arrays have names and values that its file can hold."""
     for name in ("name", "fps", "tracks", "extras"):
         check_type(f"Clip.{name}", clip.__dataclass_fields__[name].type, getattr(clip, name))
-    if not 0 < clip.fps < np.inf:
-        raise ValueError(f"Clip.fps: expected a positive number, got {clip.fps!r}")
+    if not 1e-3 <= clip.fps <= 1e6:
+        raise ValueError(f"Clip.fps: expected a number from 0.001 to 1e6, got {clip.fps!r}")
+    if "\0" in clip.name:
+        raise ValueError(f"Clip.name: a file cannot hold the character 0 in {clip.name!r}; drop it")
     for key, value in clip.extras.items():
-        if not isinstance(key, str) or not key.isprintable() or key in {*taken, "", "file", "allow_pickle"}:
-            raise ValueError(f"Clip.extras: expected text that is no key of a clip's file, got {key!r}; rename it")
+        if (
+            not isinstance(key, str)
+            or not key.isprintable()
+            or key in {*taken, "", "file", "allow_pickle"}
+            or len(key) > 99
+        ):
+            raise ValueError(
+                f"Clip.extras: expected short text that is no key of a clip's file, got {key!r}; rename it"
+            )
         if (dtype := np.asarray(value).dtype).kind not in "biufcSUmM" or not dtype.itemsize:
             raise ValueError(f"Clip.extras: {key!r}: expected numbers or text, got dtype {dtype}; convert or drop it")
 
@@ -90,7 +99,7 @@ def floats(
 
     With `far`, float64 beyond 1,000 stays: places in a world whose origin is far away, which float32 would round by 0.1 mm and more.
     """
-    array = _array(name, value)
+    array = as_array(name, value)
     wanted = "(" + ", ".join("N" if s is None else str(s) for s in shape) + ")" + (f" to match {like}" if like else "")
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name}: expected numbers of shape {wanted}, got dtype {array.dtype}; convert to float32")
@@ -105,7 +114,8 @@ def floats(
     return array
 
 
-def _array(name: str, value: object) -> np.ndarray:
+def as_array(name: str, value: object) -> np.ndarray:
+    """`value` as an array, or ValueError."""
     try:
         return np.asarray(value)
     except (ValueError, TypeError) as error:
@@ -141,7 +151,7 @@ def known_depths(depths: np.ndarray) -> np.ndarray:
 
 def bools(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
     """`value` as booleans of the given shape (0 and 1 count), or ValueError."""
-    array = _array(name, value)
+    array = as_array(name, value)
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}; reorder or cut the axes")
     if array.dtype != bool and not (array.dtype.kind in "iuf" and np.isin(array, (0, 1)).all()):
@@ -192,7 +202,9 @@ def _is(kind: str, value: object) -> bool:
     if kind in ("int", "float"):
         number = isinstance(value, Integral if kind == "int" else Real) and not isinstance(value, _KINDS["bool"])
         return number and abs(value if isinstance(value, Integral) else float(value)) < 1e300  # float32 has no 1e300
-    if kind in ("Sequence", "Collection", "tuple"):
+    if kind == "tuple":
+        return isinstance(value, tuple | list)
+    if kind in ("Sequence", "Collection"):
         return isinstance(value, Collection) and not isinstance(value, str)
     if kind in _KINDS:
         return isinstance(value, _KINDS[kind])
@@ -242,6 +254,10 @@ def check_state(state: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
         if value.shape != wanted[name].shape:
             shapes = f"expected shape {tuple(wanted[name].shape)}, got {tuple(value.shape)}"
             raise ValueError(f"parameters do not fit the config: {name}: {shapes}")
+        if value.is_floating_point() != wanted[name].is_floating_point():
+            raise ValueError(
+                f"parameters do not fit the config: {name}: expected {wanted[name].dtype}, got {value.dtype}"
+            )
         if not value.float().isfinite().all():
             raise ValueError(f"parameter {name} is not finite: its training failed, or the file is damaged")
 

@@ -168,6 +168,7 @@ MIX_UPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
     "one pose dropped": (pose(dropped), "pose_missing"),
     "poses of two frames lost": (pose(lost), "poses_lost"),
     "poses drifting": (pose(drifting), "poses_drift"),
+    "no poses: all are the first one": (pose(lambda x: np.repeat(x[:1], len(x), 0)), "poses_at_rest"),
     "video mirrored": planted("colour_mirrored"),
     "video and depth mirrored": (lambda c: replace(c, video=c.video[:, :, ::-1], depths=c.depths[:, :, ::-1]), "clip_mirrored"),
     "colour early by 3 frames": (moved(3, "video"), "colour_shifted_in_time"),

@@ -104,6 +104,33 @@ def test_what_shows_without_camera_motion():
     assert verdict(replace(still, depths=(1000 * still.depths).round())) == "depth_in_millimetres"
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("decimetres", "TUM's factor 5000 forgotten", "disparity", "no poses: all are the first one"),
+        *("depth early by 3 frames", "colour early by 3 frames", "poses late by 3 frames"),
+    ],
+)
+def test_a_hand_that_hardly_travels_shows_them_where_depth_is_exact(name):
+    hand = good(3, camera="handheld", sensor=None, frames=24)
+    assert verdict(hand) == ""
+    plant, names = MIX_UPS[name]
+    assert verdict(hand, plant) == names
+
+
+def test_no_remedy_flattens_the_depth(clip):
+    for case in (clip, good(3, camera="handheld", sensor=None, frames=24)):
+        wrong = MIX_UPS["relative depth, scaled per frame"][0](case)
+        for finding in check_clip(wrong):
+            after = finding.fix(wrong).depths
+            assert np.ptp(np.log(after[after > 0])) > 0.5 * np.ptp(np.log(case.depths[case.depths > 0]))
+
+
+def test_sparse_depth_is_no_evidence(clip):
+    known = np.random.default_rng(0).random(clip.depths.shape) < 0.05
+    assert check_clip(replace(clip, depths=np.where(known, clip.depths, 0))) == []
+
+
 def test_an_unknown_cause_is_said_with_what_is_likeliest(clip):
     noise = np.random.default_rng(0).integers(0, 255, (16, *clip.size, 3)).astype(np.uint8)
     scene = np.random.default_rng(0).uniform(1, 5, (16, 12, 16)).repeat(8, 1).repeat(8, 2)

@@ -69,6 +69,6 @@ def test_all_tests_run_side_by_side_and_either_may_fail(run, monkeypatch, capfd,
 
     monkeypatch.setattr(run, "_python", fake)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.setenv("TAPIP3D_MINUTES", "0.4")
+    monkeypatch.setenv("TAPIP3D_MINUTES", "0.2")
     assert run.run_test() == code
     assert capfd.readouterr().out.split("\n")[:2] == ["of tests", "of notebooks"]

@@ -18,6 +18,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tapip3d_lite.geometry import THRESHOLDS
+from tapip3d_lite.validate import floats
 
 Array = np.ndarray
 SCALINGS = ("median", "mean", "none", "per_trajectory", "reproduce_2d", "median_on_queries")
@@ -49,7 +50,7 @@ def tapvid3d_metrics(
         ValueError: shapes that do not fit, an unknown scaling, or queries missing where the scaling needs them.
     """
     p, v, q, w = _checked(gt_xyz, gt_visible, xyz, visible, 3)
-    focal = np.asarray(intrinsics, np.float64)
+    focal = floats("intrinsics", intrinsics, (None,) * (np.ndim(intrinsics) or 2)).astype(np.float64)
     if focal.shape[-2:] != (3, 3) or focal.ndim not in (2, 3) or (focal.ndim == 3 and len(focal) != len(p)):
         raise ValueError(f"intrinsics: expected ({len(p)}, 3, 3) or (3, 3), got {focal.shape}")
     if not (focal[..., [0, 1], [0, 1]] > 0).all():

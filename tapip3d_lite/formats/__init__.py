@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from tapip3d_lite.clip import Clip
-from tapip3d_lite.files import atomic_path, npz_keys, write_text
+from tapip3d_lite.files import atomic_path, npz_keys, regular, write_text
 from tapip3d_lite.formats.arrays import load_own_clip, megasam, read_depths, result, tapvid3d, vggt
 from tapip3d_lite.formats.folders import load_parts
 from tapip3d_lite.formats.images import VIDEOS
@@ -50,8 +50,8 @@ def load_clip(
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, got {format!r}")
     if any((x or 0) < 0 for x in (frames.start, frames.stop, frames.step)):
         raise ValueError(f"frames: expected a slice without negative numbers, got {frames}; count from the first frame")
-    if not path.exists():
-        raise ValueError(f"{path}: no such file; check the path")
+    if not path.is_dir():
+        regular(path)
     kind = _recognised(path) if format == "auto" else format
     if (kind in _FOLDERS) != path.is_dir() and path.suffix.lower() not in VIDEOS:
         raise ValueError(f"{path}: format {kind} is that of a {'folder' if kind in _FOLDERS else 'file'}; give one")
@@ -91,9 +91,9 @@ def _recognised(path: Path) -> str:
         raise ValueError(f"{path}: a packed Record3D recording; unzip it and give the folder")
     keys = npz_keys(path)
     marks = {
-        "tapvid3d": "images_jpeg_bytes" in keys,
         "result": keys >= {"coords", "visibs", "query_points"},
         "npz": keys >= {"video", "depths"},
+        "tapvid3d": "images_jpeg_bytes" in keys,
         "megasam": "cam_c2w" in keys,
         "vggt": keys & {"image", "images"} and keys & {"depth", "depths"} and keys & {"extrinsic", "extrinsics"},
     }
@@ -115,8 +115,9 @@ def save_clip(clip: Clip, path: str | Path) -> None:
     for t, (image, depth) in enumerate(zip(clip.video, clip.depths, strict=True)):
         for name, content in ((f"rgb/{t:06d}.png", image[..., ::-1]), (f"depth/{t:06d}.tiff", depth)):
             with atomic_path(path / name) as temporary:
-                cv2.imwrite(str(temporary), content)
+                temporary.write_bytes(cv2.imencode(temporary.suffix, content)[1].tobytes())
     for name, matrices in (("poses.txt", clip.extrinsics), ("intrinsics.txt", clip.intrinsics)):
-        rows = [" ".join(f"{x:.9g}" for x in matrix.ravel()) for matrix in np.asarray(matrices)]
+        digits = 17 if matrices.dtype == np.float64 else 9
+        rows = [" ".join(f"{x:.{digits}g}" for x in matrix.ravel()) for matrix in matrices]
         write_text(path / name, "\n".join(rows) + "\n")
     write_text(path / "clip.json", json.dumps({"poses": "world_to_camera", "fps": clip.fps}) + "\n")

@@ -96,6 +96,8 @@ def vggt(path: Path, _points: bool) -> Clip:
     require(path, arrays, "such a clip", keys, "export the images and the cameras with the depth")
     batch = arrays["image"].ndim == 5  # of one clip
     images, depths, intrinsics, top = (arrays[key][0] if batch else arrays[key] for key in keys)
+    depths = depths[:, 0] if depths.ndim == 4 and depths.shape[1] == 1 else depths
+    intrinsics = np.broadcast_to(intrinsics, (len(top), 3, 3)) if intrinsics.ndim == 2 else intrinsics
     extrinsics = np.tile(np.eye(4), (len(top), 1, 1))
     extrinsics[:, :3] = top[:, :3]
     return Clip(_video(images), depths[..., 0] if depths.ndim == 4 else depths, intrinsics, extrinsics, name=path.stem)
@@ -122,6 +124,8 @@ def tapvid3d(path: Path, points: bool, depth: str | Path | None = None) -> Clip:
         depths = np.stack([fit_depth(image, size, depth) for image in read_depths(depth)])
     world = transform(xyz, invert(extrinsics))
     times = np.rint(arrays["queries_xyt"][:, 2]).astype(int)
+    if times.min(initial=0) < 0 or times.max(initial=0) >= len(video):
+        raise ValueError(f"{path}: queries_xyt ask in frame {times.max()} of {len(video)}; the order is x, y, t")
     queries = np.concatenate([times[:, None], world[times, np.arange(len(times))]], 1)
     tracks = Tracks(world, visible, queries) if points else None
     return Clip(video, depths, intrinsics, extrinsics, tracks=tracks, name=path.stem, fps=30.0)
@@ -147,6 +151,8 @@ def read_depths(path: str | Path) -> np.ndarray:
 def _video(images: np.ndarray) -> np.ndarray:
     """(T, H, W, 3) uint8 of images with colours first or last, up to 255 or up to 1."""
     images = np.moveaxis(images, 1, -1) if images.ndim == 4 and images.shape[1] == 3 != images.shape[-1] else images
+    if images.dtype.kind == "f" and images.min(initial=0) < 0:
+        raise ValueError("images: expected colours in [0, 1] or [0, 255], got negative ones; undo the normalisation")
     if images.dtype.kind == "f":
         images = np.rint(np.clip(images * (255 if images.max() <= 1 else 1), 0, 255)).astype(np.uint8)
     return np.ascontiguousarray(images)

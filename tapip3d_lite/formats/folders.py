@@ -31,6 +31,7 @@ class Settings:
         intrinsics: fx, fy, cx, cy or a 3x3 matrix of the colour camera, in pixels; `intrinsics.txt` may hold them, too.
         made_for: (W, H) of the images that the intrinsics were made for, if others than these.
         depth_intrinsics: intrinsics of a depth camera of its own, whose poses the poses are.
+        depth_made_for: (W, H) of the depth images that those were made for, if others than these.
         color_from_depth: 4x4, X_color = color_from_depth X_depth.
         depth_scale: whole numbers of depth images per scene unit; other numbers are in scene units.
         no_depth: the whole number that means unknown, beside 0.
@@ -46,6 +47,7 @@ class Settings:
     intrinsics: Sequence | None = None
     made_for: Sequence[int] | None = None
     depth_intrinsics: Sequence | None = None
+    depth_made_for: Sequence[int] | None = None
     color_from_depth: Sequence | None = None
     depth_scale: float = 1000.0
     no_depth: float = 65535
@@ -69,7 +71,10 @@ class Settings:
             given |= read_json(path)
         if given.keys() - known:
             raise ValueError(f"{path}: unknown {', '.join(given.keys() - known)}; known are {', '.join(sorted(known))}")
-        return cls(**(defaults | ({"made_for": None} if "intrinsics" in given else {}) | given))
+        for key in ("", "depth_"):  # whoever gives a camera gives that of these images
+            if f"{key}intrinsics" in given:
+                defaults[f"{key}made_for"] = None
+        return cls(**(defaults | given))
 
 
 @dataclass
@@ -131,6 +136,7 @@ def _depths(parts: Parts, frames: slice, intrinsics: np.ndarray, shift: np.ndarr
         depth = parts.read(path) if parts.read else read_depth(path, s.depth_scale, s.no_depth)
         if s.depth_intrinsics is not None:
             own = matrix(s.depth_intrinsics, "clip.json: depth_intrinsics")
+            own = own if s.depth_made_for is None else _of_size(own, s.depth_made_for, depth.shape, path)
             depth = register_depth(depth, own, k, shift, size)
         depths.append(fit_depth(depth, size, path))
     depths = np.stack(depths)
@@ -142,7 +148,9 @@ def _images(paths: list[Path], folder: Path) -> np.ndarray:
     images = [decode_color(path.read_bytes(), path) for path in paths]
     sizes = {image.shape[1::-1] for image in images}
     if len(sizes) != 1:
-        raise ValueError(f"{folder}: colour images of sizes {sorted(sizes) or 'none'}; expected some, all of one size")
+        raise ValueError(
+            f"{folder}: colour images of sizes {sorted(sizes) or 'none'}; expected some, all of one size, in the frames asked for"
+        )
     return np.stack(images)
 
 
@@ -157,7 +165,18 @@ def _intrinsics(parts: Parts, size: tuple[int, int]) -> np.ndarray:
         given = numbers.reshape(count, 9) if numbers.size == 9 * count else [numbers] * count
     each = parts.intrinsics if given is None else given
     matrices, made_for = np.stack([matrix(x, name) for x in each]), parts.settings.made_for
-    return matrices if made_for is None else resize_intrinsics(matrices, (made_for[1], made_for[0]), size)
+    return matrices if made_for is None else _of_size(matrices, made_for, size, name)
+
+
+def _of_size(matrices: np.ndarray, made_for: Sequence[int], size: tuple[int, int], name: object) -> np.ndarray:
+    """Intrinsics of images (W, H) for images (H, W); ValueError where those were cropped or turned."""
+    width, height = made_for
+    if width != height and abs(width / height * size[0] / size[1] - 1) > 0.02:
+        raise ValueError(
+            f"{name}: the camera is known for images of {width}x{height}, which these of {size[1]}x{size[0]} are not a "
+            "smaller form of; write their fx fy cx cy into intrinsics.txt, or depth_intrinsics into clip.json"
+        )
+    return resize_intrinsics(matrices, (height, width), size)
 
 
 def matrix(given: Sequence, name: str) -> np.ndarray:
@@ -221,6 +240,7 @@ def numbered(folder: Path, suffixes: Sequence[str], pattern: str = "") -> list[P
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder; was the export complete?")
     found = [x for x in folder.iterdir() if x.suffix.lower() in suffixes and re.search(pattern, x.name)]
+    found = [x for x in found if not x.name.startswith(".")]  # macOS writes ._1.png beside 1.png
     numbers = {x: [int(n) for n in re.findall(r"\d+", x.stem)] for x in found}
     found.sort(key=lambda x: (numbers[x], x.name))
     rows = np.array([numbers[x] for x in found]) if len({len(n) for n in numbers.values()}) == 1 else np.zeros((0, 1))

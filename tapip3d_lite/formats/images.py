@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tapip3d_lite.files import map_npy
+from tapip3d_lite.files import for_opencv, map_npy
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 DEPTHS = (".png", ".tif", ".tiff", ".exr", ".npy", ".pfm")
@@ -26,7 +26,7 @@ def decode_color(data: bytes, name: object) -> np.ndarray:
 
 def read_video(path: Path, frames: slice) -> tuple[np.ndarray, int, float]:
     """The chosen frames (T, H, W, 3) uint8 RGB of a video, how many it has, and frames per second; ValueError if none."""
-    video, chosen, wanted, count = cv2.VideoCapture(str(path)), [], range(*frames.indices(1 << 40)), 0
+    video, chosen, wanted, count = cv2.VideoCapture(for_opencv(path)), [], range(*frames.indices(1 << 40)), 0
     while video.grab():
         if count in wanted:
             chosen.append(np.ascontiguousarray(video.retrieve()[1][..., ::-1]))

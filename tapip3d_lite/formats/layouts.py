@@ -86,7 +86,8 @@ def seven_scenes(folder: Path) -> Parts:
     kinds = (("color", (".png", ".jpg")), ("depth", (".png",)), ("pose", (".txt",)))
     color, depth, poses = (numbered(folder, ends, rf"^frame-\d+\.{kind}\.") for kind, ends in kinds)
     kinect = {"intrinsics": (525.0, 525.0, 320.0, 240.0), "depth_intrinsics": (585.0, 585.0, 320.0, 240.0)}
-    settings = Settings.read(folder, **kinect, color_from_depth=_COLOR_FROM_DEPTH, made_for=(640, 480))
+    made_for = dict.fromkeys(("made_for", "depth_made_for"), (640, 480))
+    settings = Settings.read(folder, **kinect, **made_for, color_from_depth=_COLOR_FROM_DEPTH)
     return Parts(folder, color, depth, np.stack([np.stack(table(x)) for x in poses]), settings)
 
 
@@ -120,14 +121,16 @@ def _packed(path: Path, shape: tuple[int, int]) -> np.ndarray:
 
 def movi(folder: Path) -> Parts:
     """Kubric MOVi: `rgba_00000.png`, `depth_00000.tiff` (or 16-bit PNG with `data_ranges.json`), `metadata.json`."""
-    camera = read_json(folder / "metadata.json")["camera"]
+    about = read_json(folder / "metadata.json")
+    camera, fps = about["camera"], about.get("metadata", {}).get("frame_rate", 12)
     depth, read = numbered(folder, DEPTHS, r"^depth_\d+\."), None
     if depth and depth[0].suffix == ".png":
         span = read_json(folder / "data_ranges.json")["depth"]
         read = partial(_between, low=span["min"], high=span["max"])
     quaternions = np.array(camera["quaternions"], np.float64)[:, [1, 2, 3, 0]]  # w x y z
     poses = rigid(np.array(camera["positions"]), quaternions)
-    return _kubric(folder, numbered(folder, PICTURES, r"^rgba?_\d+\."), depth, poses, [camera["K"]] * len(poses), read)
+    color, each = numbered(folder, PICTURES, r"^rgba?_\d+\."), [camera["K"]] * len(poses)
+    return _kubric(folder, color, depth, poses, each, read, fps)
 
 
 def kubric(folder: Path) -> Parts:
@@ -145,11 +148,13 @@ def kubric(folder: Path) -> Parts:
     return parts
 
 
-def _kubric(folder: Path, color: list, depth: list, poses: object, normalised: object, read: object) -> Parts:
+def _kubric(
+    folder: Path, color: list, depth: list, poses: object, normalised: object, read: object, fps: float = 12.0
+) -> Parts:
     """Ray lengths, Blender's axes, and K of an image of size 1 that begins at 0: ours begins at -1/2."""
     intrinsics = np.abs(np.array(normalised, np.float64))  # K's second and third columns are negative, as the axes are
     intrinsics[:, :2, 2] -= 0.5
-    settings = Settings.read(folder, axes="opengl", depth_is="ray", made_for=(1, 1), fps=12.0)
+    settings = Settings.read(folder, axes="opengl", depth_is="ray", made_for=(1, 1), fps=float(fps))
     return Parts(folder, color, depth, np.array(poses, np.float64), settings, intrinsics, read)
 
 

@@ -32,7 +32,7 @@ from tapip3d_lite.lab.train import interruptible
 from tapip3d_lite.lab.variant import Variant
 from tapip3d_lite.measures import flawed_on_purpose
 from tapip3d_lite.training.run_folder import read_log
-from tapip3d_lite.validate import check_names, checked
+from tapip3d_lite.validate import check_device, check_names, checked
 
 
 class Study:
@@ -194,6 +194,7 @@ def run_together(studies: Sequence[Study], jobs: int, device: str, stop: Callabl
     """
     if jobs < 1:
         raise ValueError(f"Study.run: expected at least one job, got {jobs}")
+    check_device(device)
     plans = [(study.plan, study.plan.find_clips(jobs, progress)) for study in studies]
     with interruptible() as interrupted:
         work = partial(_work, jobs, lambda: stop() or interrupted(), progress)
@@ -216,8 +217,8 @@ def _chosen(budget: str | Budget | None, old: dict[str, Any] | None, parts: Sequ
         return budget
     if budget is None and old is not None:
         return Budget.from_dict(old["budget"], parts)
-    check_names("Study.budget", [budget or "lab"], BUDGETS)
-    return BUDGETS[budget or "lab"]
+    check_names("Study.budget", ["lab" if budget is None else budget], BUDGETS)
+    return BUDGETS["lab" if budget is None else budget]
 
 
 def _work(processes: int, stop: Callable[[], bool], progress: bool, todo: Sequence[Job]) -> dict[str, str] | None:

@@ -22,7 +22,7 @@ from tapip3d_lite.model.spaces import fitted
 from tapip3d_lite.model.track import check_options, visibility
 from tapip3d_lite.model.windows import Scene, State, Step, to_world
 from tapip3d_lite.queries import near_origin, shifted, support_queries
-from tapip3d_lite.validate import checked, floats
+from tapip3d_lite.validate import as_array, checked, floats
 
 
 class Stream:
@@ -75,6 +75,7 @@ class Stream:
         self.seen, self.length, self.begin = 0, None, 0  # frames pushed; real ones, once finished; of `past`
         self.queries, self.past = np.zeros((0, 4), np.float32), np.zeros((0, 0, 5), np.float32)  # x, y, z, v, visible
         self.shift = np.zeros(3)  # of the world, once there is a frame
+        self.frame_size: tuple[int, int] | None = None
         self.numbers = np.zeros(0, int)  # of the columns: rows of `queries`, or -1 for the support grid's
         self.rows = torch.zeros(1, 0, 4, device=next(tracker.parameters()).device)
         nothing = self.rows.new_zeros(1, tracker.config.window, 0, 3)
@@ -108,8 +109,9 @@ class Stream:
 
         ValueError for numbers that are not followed.
         """
+        self._check_open()
         if not np.isin(numbers, self.followed).all():
-            raise ValueError(f"drop: expected numbers of {self.followed.tolist()}, got {np.asarray(numbers).tolist()}")
+            raise ValueError(f"drop: expected numbers of {self.followed.tolist()}, got {numbers!r}"[:500])
         left = torch.from_numpy(np.flatnonzero(~np.isin(self.numbers, numbers))).to(self.rows.device)
         s, self.rows, self.known = self.state, self.rows[:, left], self.known[left]
         self.numbers = self.numbers[left.cpu().numpy()]
@@ -135,7 +137,11 @@ class Stream:
             ValueError: arrays that do not fit, as for `Clip`, or the stream is finished.
         """
         self._check_open()
-        clip = Clip(image[None], depth[None], np.asarray(intrinsics)[None], np.asarray(extrinsics)[None])
+        each = ("image", image), ("depth", depth), ("intrinsics", intrinsics), ("extrinsics", extrinsics)
+        clip = Clip(*(as_array(f"push: {name}", value)[None] for name, value in each))
+        if self.frame_size not in (None, clip.size):
+            raise ValueError(f"push: expected a frame of {self.frame_size} (H, W) as before, got {clip.size}")
+        self.frame_size = clip.size
         clip, self.shift = near_origin(clip, self.shift if self.seen else None)
         clip = resize_clip(clip, self.tracker.config.image_size, self.tracker.config.as_released)
         frames = frames_from_clip(clip, device=self.rows.device)

@@ -77,7 +77,7 @@ def read_weights(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
-    except SafetensorError as error:
+    except (SafetensorError, MemoryError) as error:
         raise ValueError(
             f"{path}: not a readable safetensors file ({error}); the authors' .pth goes through load_official"
         ) from error

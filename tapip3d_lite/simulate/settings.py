@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from tapip3d_lite.simulate.meshes import MESHES
 from tapip3d_lite.validate import check_range, check_types
 
@@ -63,11 +61,14 @@ class SimulationConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_range(self, 1, np.inf, "frames", "tracks")
-        check_range(self, 8, np.inf, "size")
-        check_range(self, 1, np.inf, "moving")
-        check_range(self, 0, np.inf, "resting", "handheld", "stereo_baseline")
-        check_range(self, 1e-12, np.inf, "fps", "speed", "drop")
+        check_range(self, 1, 10_000, "frames")
+        check_range(self, 1, 100_000, "tracks")
+        check_range(self, 8, 4096, "size")
+        check_range(self, 1, 40, "moving")
+        check_range(self, 0, 40, "resting")
+        check_range(self, 0, 100, "handheld", "stereo_baseline")
+        check_range(self, 1e-12, 100, "speed", "drop")
+        check_range(self, 1, 1000, "fps")
         check_range(self, 0, 1, "share_dynamic")
         for name in ("arc", "moving", "resting"):
             low, high = getattr(self, name)

@@ -101,7 +101,7 @@ class SamplingConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_range(self, 1, math.inf, "tracks")
+        check_range(self, 1, 1e5, "tracks")
         check_range(self, 0, 1, "seen", "anywhere", "backward")
 
 

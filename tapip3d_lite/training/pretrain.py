@@ -64,7 +64,7 @@ class MatchingConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_range(self, 1, math.inf, "pairs", "points", "gap", "levels")
+        check_range(self, 1, 1e5, "pairs", "points", "gap", "levels")
         check_range(self, 1e-12, math.inf, "spread", "clip_norm")
         check_range(self, 1e-12, 1e3, "lr")
         check_range(self, 0, math.inf, "place", "jitter", "weight_decay")

@@ -111,7 +111,8 @@ class TrainConfig:
         for name in ("frames", "iterations"):
             if not 1 <= getattr(self, name)[0] <= getattr(self, name)[1]:
                 raise ValueError(f"TrainConfig.{name}: expected (fewest, most) from 1 on, got {getattr(self, name)}")
-        check_range(self, 1, math.inf, "clips", "steps", "batch", "evaluate_every", "save_every")
+        check_range(self, 1, 1e9, "clips", "steps", "evaluate_every", "save_every")
+        check_range(self, 1, 4096, "batch")
         check_range(self, 0, math.inf, "matching_steps", "validation", "average", "weight_decay", "head")
         check_range(self, 0, 2**63, "seed")
         check_range(self, 0, 1, "short", "sensor")

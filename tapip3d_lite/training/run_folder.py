@@ -117,7 +117,7 @@ def read_log(path: str | Path) -> list[dict[str, Any]]:
     """The lines of a `log.jsonl`, or of the one in a folder, without a half-written last one; ValueError: there is none."""
     path = Path(path)
     path = path / "log.jsonl" if path.is_dir() else path
-    if not path.exists():
+    if not path.is_file():
         raise ValueError(f"{path}: no such log; give the folder of a training")
     *texts, last = path.read_text(encoding="utf-8", errors="replace").split("\n")
     try:
