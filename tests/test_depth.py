@@ -154,17 +154,25 @@ def test_a_sensor_is_nearer_to_the_truth_once_filtered():
         (lambda: t3d.filter_depth(np.ones((1, 4, 5)) > 0), "depths: expected numbers"),
         (lambda: t3d.filter_depth(np.ones((1, 4, 5)), edge=0), "edge"),
         (lambda: t3d.densify_depth([[["a"]]]), "depths: expected numbers"),
-        (lambda: t3d.register_depth(np.ones((1, 4, 5)), K, K, np.eye(4), (4, 5)), "depth: expected shape"),
+        (lambda: t3d.t3d.register_depth(np.ones((1, 4, 5)), K, K, np.eye(4), (4, 5)), "depth: expected shape"),
         (
-            lambda: t3d.register_depth(np.ones((4, 5)), K, K, np.eye(3), (4, 5)),
+            lambda: t3d.t3d.register_depth(np.ones((4, 5)), K, K, np.eye(3), (4, 5)),
             r"color_from_depth: expected shape \(4, 4\)",
         ),
-        (lambda: t3d.register_depth(np.ones((4, 5)), K[None], K, np.eye(4), (4, 5)), "depth_intrinsics: expected"),
+        (lambda: t3d.t3d.register_depth(np.ones((4, 5)), K[None], K, np.eye(4), (4, 5)), "depth_intrinsics: expected"),
     ],
 )
 def test_bad_depth(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_wider_depth_camera_leaves_no_holes():
+    narrow, wide = np.diag([100.0, 100, 1]), np.diag([60.0, 60, 1])
+    narrow[:2, 2] = wide[:2, 2] = 39.5
+    seen = t3d.register_depth(np.full((80, 80), 2, np.float32), wide, narrow, np.eye(4), (80, 80))
+    assert (seen == 2).all()
+    assert not t3d.register_depth(np.zeros((0, 3), np.float32), wide, narrow, np.eye(4), (8, 8)).any()
 
 
 def test_registration_to_rounding():

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import plotly.graph_objects as go
 import pytest
 
 import tapip3d_lite as t3d
-from tapip3d_lite.export import overlay
+from tapip3d_lite.export import check_export, overlay
 from tapip3d_lite.figures.flat import track_colors
 from tapip3d_lite.geometry import project, transform
 
@@ -103,6 +104,26 @@ def test_points_far_outside_or_unknown_do_no_harm(clip):
     xyz[1, 0], xyz[2, 1] = np.nan, 1e20
     drawn = overlay(t3d.Tracks(xyz, clip.tracks.visible, clip.tracks.queries), clip)
     assert drawn.shape[0] == 5
+
+
+@pytest.mark.parametrize("name", ["\udcff.mp4", "\udcff.gif"])
+def test_a_name_that_opencv_cannot_take_is_refused(clip, tmp_path, name):
+    with pytest.raises(ValueError, match="no UTF-8"):
+        t3d.export_tracks(clip.tracks, tmp_path / name, clip)
+    assert not list(tmp_path.iterdir())
+    t3d.save_clip(clip, tmp_path / "\udcff")  # images need no name there
+    assert len(t3d.load_clip(tmp_path / "\udcff")) == len(clip)
+
+
+def test_what_cannot_be_written_is_known_before_the_work(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "a.csv", "/proc/a.csv" if os.getuid() else tmp_path / "file" / "b.npz"):
+        with pytest.raises(ValueError, match="no folder in which files can be written"):
+            check_export(path)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(ValueError, match="rerun-sdk"):
+        check_export(tmp_path / "a.rrd")
+    assert check_export(tmp_path / "new" / "A.CSV") == ".csv"
 
 
 def test_an_unknown_suffix_writes_nothing(clip, tmp_path):

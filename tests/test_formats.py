@@ -486,6 +486,63 @@ def test_7scenes_registers_the_depth_camera(clip, tmp_path):
     assert plain.intrinsics[0, 0, 0] == pytest.approx(52.5) and plain.intrinsics[0, 0, 2] == pytest.approx(31.55)
 
 
+def test_7scenes_of_smaller_images(tmp_path):
+    """The depth camera that the layout assumes is that of 640x480, too."""
+    clip = t3d.simulate_clip(3, frames=3, size=(480, 640), tracks=4, moving=(1, 1), resting=(0, 0))
+    for scale, folder in ((1, tmp_path / "large"), (2, tmp_path / "small")):
+        for t in range(3):
+            put(folder / f"frame-{t:06d}.color.png", np.ascontiguousarray(clip.video[t, ::scale, ::scale]))
+            put(folder / f"frame-{t:06d}.depth.png", whole(clip.depths[t, ::scale, ::scale], 1000))
+            text(folder / f"frame-{t:06d}.pose.txt", poses(clip)[t])
+    large, small = (t3d.load_clip(tmp_path / name) for name in ("large", "small"))
+    found = large.depths[:, ::2, ::2]
+    both = (found > 0) & (small.depths > 0)
+    assert both.mean() > 0.5
+    assert np.median(np.abs(small.depths[both] / found[both] - 1)) < 0.01
+
+
+def test_a_camera_of_another_shape_is_not_stretched(clip, tmp_path):
+    write_tum(clip, tmp_path)
+    (tmp_path / "intrinsics.txt").unlink(missing_ok=True)
+    (tmp_path / "clip.json").unlink(missing_ok=True)
+    for folder in ("rgb", "depth"):
+        for path in (tmp_path / folder).glob("*.png"):
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(path), np.ascontiguousarray(image[:, : image.shape[1] // 2]))
+    with pytest.raises(ValueError, match=r"640x480, which these of .* not a smaller form of; write their fx fy cx cy"):
+        t3d.load_clip(tmp_path)
+
+
+def test_small_things_of_other_programs(clip, tmp_path):
+    path = write_movi(clip, tmp_path / "movi")
+    about = json.loads((path / "metadata.json").read_text()) | {"metadata": {"frame_rate": 24}}
+    (path / "metadata.json").write_text(json.dumps(about))
+    assert t3d.load_clip(path).fps == 24
+    (tmp_path / "mac").mkdir()
+    write_folder(clip, tmp_path / "mac")
+    first = next(
+        x for x in (tmp_path / "mac").rglob("*.*") if x.suffix in (".png", ".jpg") and "depth" not in str(x.parent.name)
+    )
+    (first.parent / f"._{first.name}").write_bytes(b"macOS")
+    assert len(t3d.load_clip(tmp_path / "mac")) == len(clip)
+    images, top = np.moveaxis(clip.video, -1, 1) / np.float32(255), clip.extrinsics[:, :3]
+    arrays = {"images": images, "depth": clip.depths[:, None], "intrinsic": clip.intrinsics[0], "extrinsic": top}
+    np.savez(tmp_path / "one.npz", **arrays)
+    read = t3d.load_clip(tmp_path / "one.npz")
+    assert np.array_equal(read.depths, clip.depths) and np.array_equal(read.video, clip.video)
+    np.savez(tmp_path / "normal.npz", **arrays | {"images": 2 * images - 1})
+    with pytest.raises(ValueError, match="got negative ones; undo the normalisation"):
+        t3d.load_clip(tmp_path / "normal.npz")
+
+
+def test_a_folder_keeps_a_far_world(clip, tmp_path):
+    far = clip.extrinsics.astype(np.float64)
+    far[:, :3, 3] -= far[:, :3, :3] @ [4e6, 5e5, 300]
+    moved = replace(clip, extrinsics=far, queries=None, tracks=None)
+    t3d.save_clip(moved, tmp_path / "far")
+    assert np.abs(t3d.load_clip(tmp_path / "far").extrinsics - far).max() < 1e-8
+
+
 # --- EXR ------------------------------------------------------------------------------------------------------------
 
 

@@ -1,5 +1,6 @@
 """Misuses of the command line and of the Python interface: each ends in one line that says what is wrong."""
 
+import os
 import shlex
 import signal
 import sys
@@ -44,6 +45,7 @@ def place(tmp_path_factory):
     (folder / "study.toml").write_text("rows = 5\n")
     (folder / "study2.toml").write_text("[rows.a]\nnonsense = 1\n")
     (folder / "film.mp4").write_bytes(b"no film")
+    os.mkfifo(folder / "pipe")  # nobody ever writes into it
     (folder / "tum").mkdir()
     (folder / "tum" / "rgb.txt").write_text("1.0 absent.png\n")
     (folder / "tum" / "depth.txt").write_text("1.0 absent.png\n")
@@ -112,6 +114,14 @@ track clip.npz --tracker static --html page.txt
 track clip.npz --tracker static --html /proc/nowhere/o.html
 track clip.npz --tracker static --png picture.jpg
 track clip.npz --tracker static --png /proc/nowhere/o.png
+track clip.npz --tracker static --out a.csv text.npz/o.csv
+track clip.npz --tracker static --pixels /dev/null
+track clip.npz --tracker static --pixels pipe
+track clip.npz --tracker static --mask clip.npz --dense
+track clip.npz --tracker static --mask absent.png
+track clip.npz --tracker static --frame 99
+track clip.npz --tracker static --grid 99999999999999999999
+track pipe
 evaluate
 evaluate absent.npz
 evaluate plain.npz
@@ -121,6 +131,10 @@ evaluate clip.npz --device tpu --tracker tiny.safetensors
 evaluate clip.npz cut.npz --tracker static
 evaluate clip.npz --format x
 benchmark --split nonsense
+benchmark --split
+benchmark --tracker
+benchmark --figure o.jpg
+benchmark --out pipe --tracker static --count 1
 benchmark --count 0
 benchmark --count -3
 benchmark --count x
@@ -158,6 +172,12 @@ simulate --out x --count x
 simulate --out x --first-seed -1
 simulate --out x --workers -1
 simulate --out x --workers 0.5
+simulate --out x --workers 0
+simulate --out x --count 99999999999999999999
+simulate --out x --fps 1e200
+simulate --out x --size 99999999 99999999
+simulate --out x --frames 9999999999
+simulate --out x --tracks 999999999999
 simulate --out x --camera moon
 simulate --out x --size 32
 simulate --out x --size 4 4
@@ -171,6 +191,10 @@ simulate --out text.npz --count 1
 simulate --out /proc/nowhere --count 1
 train
 train --out x --preset nonsense
+train --out x --preset
+train --out x --matching.pairs 99999999999
+train --out x --batch 99999999999999999999
+train --out x --sampling.tracks 999999999999
 train --out x --device cuda
 train --out x --device mps
 train --out x --device tpu
@@ -216,6 +240,7 @@ curves run --out picture.txt
 curves run --out /proc/nowhere/o.png
 curves run
 curves clip.npz
+curves pipe
 curves wrong.json
 curves list.json
 lab fly
@@ -227,6 +252,9 @@ lab table nonsense
 lab table list.json
 lab table latin.json
 lab run clip.npz
+lab run coordinates --device tpu
+lab run coordinates --budget ""
+lab run coordinates --seeds 0
 lab report absent
 lab table run
 import absent.pth o.safetensors

@@ -175,7 +175,7 @@ def test_a_finished_stream_takes_nothing_more(tracker, clip):
     stream = tracker.stream(clip.queries)
     feed(stream, clip.cut(0, 5))
     first = stream.finish()
-    for refused in (lambda: feed(stream, clip), lambda: stream.add(clip.queries)):
+    for refused in (lambda: feed(stream, clip), lambda: stream.add(clip.queries), lambda: stream.drop([0])):
         with pytest.raises(ValueError, match="this stream is finished; begin another"):
             refused()
     np.testing.assert_array_equal(stream.finish().xyz, first.xyz)  # once more, the same
@@ -196,6 +196,12 @@ def test_bad_additions(tracker, clip):
     stream.drop(3)
     with pytest.raises(ValueError, match="drop"):
         stream.drop(3)
+    cameras = clip.intrinsics[8], clip.extrinsics[8]
+    with pytest.raises(ValueError, match=r"push: expected a frame of \(\d+, \d+\) \(H, W\) as before"):
+        stream.push(clip.video[8, ::2], clip.depths[8, ::2], *cameras)
+    for wrong in (None, "a", {}):
+        with pytest.raises(ValueError, match="expected"):
+            stream.push(wrong, clip.depths[8], *cameras)
 
 
 def test_memory_stays_constant():
