@@ -39,11 +39,11 @@ LOADED = [
 KNOWN = ROOT / "tests" / "data" / "equivalent_mutants" / "code.json"
 SECONDS = 300  # for the tests of one mutant: an endless loop is noticed, too
 TESTS = {  # file of the library, and the tests that hold it
-    "geometry": ("geometry.py", ["geometry", "clip", "poses"]),
+    "geometry": ("geometry.py", ["geometry", "clip", "properties"]),
     "neighbors": ("model/neighbors.py", ["neighborhoods", "knn"]),
     "n2n": ("model/n2n.py", ["model", "fast"]),
     "loss": ("training/loss.py", ["training", "matching_loss"]),
-    "metrics": ("evaluation/metrics.py", ["metrics"]),
+    "metrics": ("evaluation/metrics.py", ["metrics", "properties"]),
 }
 
 
