@@ -1,8 +1,8 @@
-"""The notebooks as a class runs them: `python -m tests.notebook_runs 03 05 --twice --offline --elsewhere --read-only`.
+"""The notebooks as a class runs them: `python -m tests.notebook_runs 03 05 --twice --offline --read-only`.
 
 `--twice` runs all cells twice in one kernel; `--sections` runs each section in a kernel of its own, after nothing but what
-it says it needs (`lessons.restart`); `--offline` refuses every connection but the kernel's own; `--elsewhere` starts in an
-empty folder; `--read-only` sees the repository and the home folder where nothing can be written (Linux, `unshare`). Stubs are
+it says it needs (`lessons.restart`); `--offline` refuses every connection but the kernel's own;
+`--read-only` sees the repository and the home folder where nothing can be written (Linux, `unshare`). Stubs are
 not filled in unless `--solved`. Ways may be combined. Set TAPIP3D_STEPS and TAPIP3D_MINUTES as `run.py test` does.
 """
 
@@ -67,7 +67,7 @@ def read_only():
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", help="beginnings of notebook names; default: all")
-    for way in ("twice", "sections", "offline", "elsewhere", "read-only", "solved"):
+    for way in ("twice", "sections", "offline", "read-only", "solved"):
         parser.add_argument(f"--{way}", action="store_true")
     options = parser.parse_args()
     if options.read_only and "TAPIP3D_READ_ONLY" not in os.environ:
@@ -82,15 +82,15 @@ def main():
         if options.read_only:
             assert subprocess.run(["touch", ROOT / "x"], capture_output=True).returncode, "it can be written"
             os.environ |= {f"JUPYTER_{kind}_DIR": folder for kind in ("CONFIG", "DATA", "RUNTIME")}
+            os.environ["IPYTHONDIR"] = folder
         for path in notebooks():
             if options.names and not path.stem.startswith(tuple(options.names)):
                 continue
             nb = nbformat.read(path, as_version=4)
             for title, part in parts(solution_copy(nb) if options.solved else nb, options):
-                begun, where = time.monotonic(), Path(folder, "empty") if options.elsewhere else FOLDER
-                where.mkdir(exist_ok=True)
+                begun = time.monotonic()
                 try:
-                    run(part, where)
+                    run(part)
                     outcome = "ran"
                 except CellExecutionError as error:
                     failed, outcome = failed + 1, f"FAILED: {error.ename}: {error.evalue}"[:600]
