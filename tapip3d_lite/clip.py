@@ -53,7 +53,12 @@ class Tracks:
             _set(self, "dynamic", bools("Tracks.dynamic", self.dynamic, (count,)))
 
     def select(self, which: np.ndarray | slice) -> Tracks:
-        """The tracks that an index, a slice or a boolean mask over N picks."""
+        """The tracks that an index, a slice or a boolean mask over N picks; ValueError for what picks none of them."""
+        try:
+            which = np.arange(len(self.queries))[which]
+        except (IndexError, TypeError, OverflowError):
+            wanted = f"an index, a slice or a mask over {len(self.queries)} tracks"
+            raise ValueError(f"Tracks.select: expected {wanted}, got {which!r}"[:300]) from None
         logits = None if self.visible_logits is None else self.visible_logits[:, which]
         dynamic = None if self.dynamic is None else self.dynamic[which]
         return Tracks(self.xyz[:, which], self.visible[:, which], self.queries[which], logits, dynamic)

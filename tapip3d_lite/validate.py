@@ -86,7 +86,7 @@ def check_about(clip: Any, taken: Collection[str]) -> None:
             or len(key) > 99
         ):
             raise ValueError(
-                f"Clip.extras: expected short text that is no key of a clip's file, got {key!r}; rename it"
+                f"Clip.extras: expected short text that is no key of a clip's file, got {str(key)[:60]!r}; rename it"
             )
         if (dtype := np.asarray(value).dtype).kind not in "biufcSUmM" or not dtype.itemsize:
             raise ValueError(f"Clip.extras: {key!r}: expected numbers or text, got dtype {dtype}; convert or drop it")
@@ -177,7 +177,7 @@ def check_range(config: object, low: float, high: float, *names: str) -> None:
 
 _KINDS = {"bool": bool | np.bool_, "type": type, "str": str, "None": type(None), "Path": PathLike}
 _KINDS |= {"slice": slice, "Mapping": Mapping}
-_OURS = {"Clip", "Tracks", "Tracker", "TrackerConfig", "SimulationConfig", "Figure"}  # other words fit anything
+_OURS = {"Clip", "Tracks", "Tracker", "TrackerConfig", "SimulationConfig", "Figure", "Axes"}  # other words fit anything
 
 
 def check_types(config: object) -> None:

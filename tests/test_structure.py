@@ -132,7 +132,7 @@ def test_sizes():
     lengths = list(functions())
     assert not [f for n, f in lengths if n > 60]
     assert statistics.median(n for n, _ in lengths) <= 15
-    assert sum(map(lines, FILES)) <= 16_250  # 10,000 before formats, parts, untrusted files and the laboratory came in
+    assert sum(map(lines, FILES)) <= 16_260  # 10,000 before formats, parts, untrusted files and the laboratory came in
     core = [path for name, path in MODULES.items() if any(f"{name}.".startswith(f"{part}.") for part in CORE)]
     assert sum(map(lines, core)) <= 3_500
 

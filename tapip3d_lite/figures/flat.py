@@ -40,6 +40,7 @@ def check_drawable(clip: Clip, tracks: Tracks | None = None, frame: int = 0) -> 
         )
 
 
+@checked
 def frame_with_tracks(
     clip: Clip, tracks: Tracks, frame: int, tail: int = 8, truth: Tracks | None = None, ax: Axes | None = None
 ) -> Figure:
@@ -51,7 +52,7 @@ def frame_with_tracks(
     check_drawable(clip, tracks, frame)
     ax = ax or _axes(clip)
     draw_image(ax, clip.video[frame], f"{clip.name} · frame {frame}")
-    span = slice(max(0, frame - tail), frame + 1)
+    span = slice(max(0, frame - max(tail, 0)), frame + 1)
     uv, z = project(tracks.xyz[span], clip.intrinsics[span], clip.extrinsics[span])
     uv = np.where((z > 0)[..., None], uv, np.nan)
     colors = track_colors(clip, tracks)
@@ -66,6 +67,7 @@ def frame_with_tracks(
     return ax.figure
 
 
+@checked
 def depth_map(clip: Clip, frame: int, ax: Axes | None = None) -> Figure:
     """Depth of one frame with a colour bar in scene units; pixels without depth are grey."""
     check_drawable(clip, frame=frame)
@@ -75,9 +77,12 @@ def depth_map(clip: Clip, frame: int, ax: Axes | None = None) -> Figure:
     return ax.figure
 
 
+@checked
 def contact_sheet(clips: Clip | Sequence[Clip], frames: int = 6, width: float = 1.35) -> Figure:
     """Frames spread over time, one row a clip."""
     clips = [clips] if isinstance(clips, Clip) else list(clips)
+    if not all(isinstance(clip, Clip) for clip in clips) or not (clips and 1 <= frames <= 1000):
+        raise ValueError(f"contact_sheet: expected clips and at least one frame of each, got {len(clips)} and {frames}")
     height, wide = clips[0].size
     figure = Figure(figsize=(frames * width, len(clips) * width * height / wide + 0.25), layout="constrained")
     grid = figure.subplots(len(clips), frames, squeeze=False)

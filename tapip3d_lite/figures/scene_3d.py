@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from tapip3d_lite.clip import Clip, Tracks
 from tapip3d_lite.figures.flat import INK, PLACES, check_drawable, track_colors
 from tapip3d_lite.geometry import transform, unproject
+from tapip3d_lite.validate import checked
 
 _LEVELS = 12  # colour levels per channel: a code into 1728 colours costs two bytes a point, an RGB string twenty
 _CHANNEL = (np.arange(_LEVELS) * 255 / (_LEVELS - 1)).round().astype(int)
@@ -23,6 +24,7 @@ _WIDE = 1.6  # width by height of the narrowest scene in which it does
 _CLOUD_COLORS = [f"rgb({r},{g},{b})" for r in _CHANNEL for g in _CHANNEL for b in _CHANNEL]
 
 
+@checked
 def tracks_3d(
     clip: Clip, tracks: Tracks, points: int = 2500, max_tracks: int = 120, tail: int = 8, title: str | None = None
 ) -> go.Figure:
