@@ -86,7 +86,7 @@ def check_about(clip: Any, taken: Collection[str]) -> None:
             or len(key) > 99
         ):
             raise ValueError(
-                f"Clip.extras: expected short text that is no key of a clip's file, got {str(key)[:60]!r}; rename it"
+                f"Clip.extras: expected short text that is no key of a clip's file, got {key!r:.60}; rename it"
             )
         if (dtype := np.asarray(value).dtype).kind not in "biufcSUmM" or not dtype.itemsize:
             raise ValueError(f"Clip.extras: {key!r}: expected numbers or text, got dtype {dtype}; convert or drop it")
