@@ -1,5 +1,6 @@
 """Misuses of the command line and of the Python interface: each ends in one line that says what is wrong."""
 
+import io
 import os
 import shlex
 import signal
@@ -11,6 +12,7 @@ import pytest
 import tapip3d_lite as t3d
 from tapip3d_lite import lab
 from tapip3d_lite.__main__ import main
+from tapip3d_lite.refusals import refusals
 from tests.tiny import SIZES
 
 
@@ -298,6 +300,23 @@ def test_a_misused_command_says_one_line(capfd, place, monkeypatch, line):
     assert "Traceback" not in error and "tyro" not in error and "-X dev" not in error
     left = [path for path in place.rglob("*") if path not in before]
     assert not left, left
+
+
+def test_an_interrupt_that_a_half_written_file_hides_is_one(capfd):
+    with pytest.raises(SystemExit, match="130"), refusals():
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise ValueError("Can't close the ZIP file while there is an open writing handle on it")
+    assert capfd.readouterr().err == "interrupted; what was finished is kept\n"
+
+
+def test_a_terminal_without_our_letters_shows_the_rest(monkeypatch):
+    terminal = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", terminal)
+    with refusals():
+        print("lite · mean", flush=True)
+    assert terminal.buffer.getvalue() == b"lite \\xb7 mean\n"
 
 
 WRONG = {

@@ -197,6 +197,10 @@ def test_foreign_and_broken_safetensors(tmp_path):
     save_file({"a": torch.zeros(1)}, tmp_path / "x.safetensors", {"format": "tapip3d_lite", "config": _config(tiny())})
     with pytest.raises(ValueError, match="do not fit"):
         t3d.load_weights(tmp_path / "x.safetensors")
+    bits = {name: value.view(torch.int32) for name, value in tiny().state_dict().items()}
+    save_file(bits, tmp_path / "bits.safetensors", {"format": "tapip3d_lite", "config": _config(tiny())})
+    with pytest.raises(ValueError, match=r"expected torch.float32, got torch.int32"):
+        t3d.load_weights(tmp_path / "bits.safetensors")
 
 
 def _config(tracker):
