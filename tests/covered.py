@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+ALL = ["tests", "--ignore=tests/test_notebooks.py"]  # notebooks run what other tests run, too
 SETTINGS = """[run]
 source = {root}/tapip3d_lite
 parallel = true
@@ -31,9 +32,9 @@ def main(tests: list[str]) -> int:
             command = [sys.executable, "-m", "coverage", arguments[0], f"--rcfile={settings}", *arguments[1:]]
             return subprocess.run(command, cwd=ROOT, env=os.environ | {"COVERAGE_RCFILE": str(settings)}).returncode
 
-        failed = coverage("run", "-m", "pytest", "-q", "-p", "no:cacheprovider", *(tests or ["tests"]))
+        failed = coverage("run", "-m", "pytest", "-q", "-p", "no:cacheprovider", *(tests or ALL))
         coverage("combine", "-q")
-        return failed or coverage("report", "--skip-covered", "--sort=cover", "--fail-under=92")
+        return coverage("report", "--skip-covered", "--sort=cover", "--fail-under=92") or failed
 
 
 if __name__ == "__main__":

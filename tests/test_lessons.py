@@ -5,11 +5,14 @@ import html
 import io
 import json
 import re
+import shutil
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 from PIL import Image
 
+from lessons import place
 from lessons.formulas import formulas
 from lessons.teaching import minutes, model_answers, question_of, read_notebook, solution_copy, tags, tasks
 from tests.mutants import KNOWN, known, mutants, survivors
@@ -211,3 +214,19 @@ def test_no_mutant_is_explained_in_vain():
         code = [solution["source"] for solution in code_cells(solution_copy(nb)) if "exercise" in tags(solution)]
         exists = {what for source in code for what, _ in mutants(source)}
         assert set(changes) <= exists, f"{KNOWN.name}/{exercise[:2]}.json: {exercise}: {sorted(set(changes) - exists)}"
+
+
+def test_a_lesson_trains_elsewhere_where_nothing_can_be_written(tmp_path, monkeypatch, capsys):
+    (tmp_path / "notebooks").mkdir()
+    monkeypatch.chdir(tmp_path / "notebooks")
+    monkeypatch.setattr(place.tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    place.folder.cache_clear()
+    assert place.folder("06") == Path("../runs/06") and Path("../runs/06").is_dir() and not capsys.readouterr().out
+    place.folder.cache_clear()
+    shutil.rmtree(tmp_path / "runs")
+    (tmp_path / "runs").write_text("no folder")
+    for _ in range(2):  # it says so once
+        assert place.folder("06") == tmp_path / "temporary" / "tapip3d_lite" / "06"
+    assert capsys.readouterr().out.count("kept elsewhere") == 1 and place.folder("06").is_dir()
+    place.folder.cache_clear()

@@ -34,6 +34,7 @@ from lessons.n06_judge import (
 from lessons.n06_setting import SMALL, follow, gpu_setting, judged_by, large_scene, setting, small_scene
 from lessons.n06_step import apart, double, example, gradients, parts, training_step
 from lessons.pictures import pipeline, show
+from lessons.place import folder
 from lessons.progress import collect, in_use, progress, reset
 from lessons.saved_bytes import SavedBytes
 from lessons.widgets import explore
@@ -63,6 +64,7 @@ __all__ = [
     "errors",
     "example",
     "explore",
+    "folder",
     "follow",
     "frozen",
     "gpu_setting",

@@ -16,6 +16,7 @@ from lessons.n08_exercises import EXERCISES
 from lessons.n08_figures import by_seed_and_clip, power_chart, with_itself_chart
 from lessons.n08_trials import differences, excludes_zero, over_clips, parts_of, with_itself
 from lessons.pictures import pipeline, show
+from lessons.place import folder
 from lessons.progress import collect, in_use, progress, reset
 from lessons.verdict import Verdict
 from lessons.widgets import explore
@@ -34,6 +35,7 @@ __all__ = [
     "differences_chart",
     "excludes_zero",
     "explore",
+    "folder",
     "in_use",
     "milestone",
     "over_clips",
@@ -58,14 +60,14 @@ def tables() -> list[str]:
     return [name for name in TABLES if (PAPER / name / "study.json").exists()]
 
 
-def shipped(name: str, budget: str | None = None, scratch: Path = Path("../runs/store")) -> tuple[Study, str]:
+def shipped(name: str, budget: str | None = None, scratch: Path | None = None) -> tuple[Study, str]:
     """A table of the paper as the library brings it along, and the row that others are compared with.
 
-    With a `budget` the one that was trained so; clips that are looked at are simulated in `scratch`. ValueError for an
-    unknown name.
+    With a `budget` the one that was trained so; clips that are looked at are simulated in `scratch`, by default
+    `folder("store")`. ValueError for an unknown name.
     """
     study, against = open_study(name, accept_code=True, budget=budget, shipped=True)
-    study.plan.scratch = scratch
+    study.plan.scratch = scratch or folder("store")
     return study, against
 
 

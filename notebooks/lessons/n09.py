@@ -19,6 +19,7 @@ from lessons.n09_evidence import evidence, hearing
 from lessons.n09_exercises import EXERCISES
 from lessons.n09_parts import Blind, NearAndAlike, Ripple, SoftMisses, Vote, errors
 from lessons.pictures import pipeline, show
+from lessons.place import folder
 from lessons.progress import collect, in_use, progress, reset
 from lessons.verdict import Verdict
 from lessons.widgets import explore
@@ -37,6 +38,7 @@ __all__ = [
     "errors",
     "evidence",
     "explore",
+    "folder",
     "hearing",
     "in_use",
     "milestone",
