@@ -204,7 +204,7 @@ def test_files_that_are_no_clips_are_refused_by_name(tmp_path, clips):
     paths["half"].write_bytes(clips[0].read_bytes()[:5000])
     paths["folder"].mkdir()
     for name, path in paths.items():
-        what = "no such file" if name == "missing" else "not a readable npz"
+        what = "no such file" if name in ("missing", "folder") else "not a readable npz"
         with pytest.raises(ValueError, match=rf"1 of 2 clips cannot be used.*\n{path}: {what}"):
             Trainer(tmp_path / "run", recipe(), [clips[0], path])
     with pytest.raises(ValueError, match="6 of 6 clips") as caught:
