@@ -154,12 +154,12 @@ def test_a_sensor_is_nearer_to_the_truth_once_filtered():
         (lambda: t3d.filter_depth(np.ones((1, 4, 5)) > 0), "depths: expected numbers"),
         (lambda: t3d.filter_depth(np.ones((1, 4, 5)), edge=0), "edge"),
         (lambda: t3d.densify_depth([[["a"]]]), "depths: expected numbers"),
-        (lambda: t3d.t3d.register_depth(np.ones((1, 4, 5)), K, K, np.eye(4), (4, 5)), "depth: expected shape"),
+        (lambda: t3d.register_depth(np.ones((1, 4, 5)), K, K, np.eye(4), (4, 5)), "depth: expected shape"),
         (
-            lambda: t3d.t3d.register_depth(np.ones((4, 5)), K, K, np.eye(3), (4, 5)),
+            lambda: t3d.register_depth(np.ones((4, 5)), K, K, np.eye(3), (4, 5)),
             r"color_from_depth: expected shape \(4, 4\)",
         ),
-        (lambda: t3d.t3d.register_depth(np.ones((4, 5)), K[None], K, np.eye(4), (4, 5)), "depth_intrinsics: expected"),
+        (lambda: t3d.register_depth(np.ones((4, 5)), K[None], K, np.eye(4), (4, 5)), "depth_intrinsics: expected"),
     ],
 )
 def test_bad_depth(call, message):
