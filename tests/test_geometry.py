@@ -5,6 +5,9 @@ import pytest
 import torch
 
 from tapip3d_lite.geometry import (
+    RASTER,
+    THRESHOLDS,
+    in_image,
     invert,
     look_at,
     pixel_grid,
@@ -131,3 +134,23 @@ def test_look_at_puts_the_target_on_the_axis_and_up_upwards():
 def test_look_at_refuses_degenerate_views(eye, target):
     with pytest.raises(ValueError, match="parallel"):
         look_at(np.array(eye), np.array(target), np.array([0.0, 0, 1]))
+
+
+def test_in_image_is_the_loop():
+    """Borders lie half a pixel outside the centres of the outer pixels, and belong to nobody."""
+    k = np.array([[2.0, 0, 2.5], [0, 4.0, 1.5], [0, 0, 1]])
+    pose = look_at(np.array([1.0, 2, 3]), np.array([2.0, 2, 5]), np.array([0, 1.0, 0.0]))
+    places = [(u, v, z) for u in (-0.75, -0.5, 0, 5, 5.5, 6) for v in (-1, -0.5, 0, 3, 3.5, 4) for z in (-2.0, 2.0)]
+    camera = np.array([[(u - 2.5) / 2 * z, (v - 1.5) / 4 * z, z] for u, v, z in places])
+    expected = np.array([z > 0 and -0.5 < u < 5.5 and -0.5 < v < 3.5 for u, v, z in places])
+    assert (in_image(camera[None], k[None], np.eye(4)[None], (4, 6))[0] == expected).all()
+    inner = np.abs(np.array(places)[:, :2] % 1 - 0.5) > 1e-9  # borders may round to either side
+    world = transform(camera, invert(pose))
+    found = in_image(world[None], k[None], pose[None], (4, 6))[0]
+    assert (found == expected)[inner.all(-1)].all()
+
+
+def test_look_at_is_rigid_and_the_benchmarks_numbers_are_theirs():
+    pose = look_at(np.array([1.0, 2, 3]), np.array([2.0, 2, 5]), np.array([0, 1.0, 0.0]))
+    assert pose[3].tolist() == [0, 0, 0, 1] and np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3))
+    assert THRESHOLDS == (1, 2, 4, 8, 16) and RASTER == 256
