@@ -156,7 +156,7 @@ def npz_keys(path: str | Path) -> set[str]:
 def map_npy(path: str | Path) -> np.ndarray:
     """The array of an npy file, read from the disk where it is used; an unreadable file is a ValueError."""
     try:
-        size = Path(path).stat().st_size
+        size = regular(path).stat().st_size
         with open(path, "rb") as file:
             dtype, shape, order, start = _npy_header(file.read(_HEAD), size)
         return np.memmap(path, dtype, "r", start, shape, order)

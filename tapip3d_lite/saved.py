@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from tapip3d_lite.archive import Archive
+from tapip3d_lite.files import regular
 from tapip3d_lite.pickled import Machine, Name, Refused, expected
 
 _STORAGES = {"CharStorage": torch.int8, "ByteStorage": torch.uint8}
@@ -31,8 +32,7 @@ def read_saved(path: str | Path) -> Any:
         ValueError: no such file, a damaged one, one that would import something else, a TorchScript program, a file of
             torch before 1.6, or a pickle of more than 4 MiB.
     """
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: no such file; check the path")
+    regular(path)
     try:
         with open(path, "rb") as file:
             reader = _Reader(Archive(file))

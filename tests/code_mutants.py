@@ -77,8 +77,13 @@ def _bare(source: str) -> str:
 def _named(source: str, what: str) -> str:
     """A mutant by its line's text, which stays when lines move: "scale = a / b: Div -> Mult"."""
     place, _, change = what.partition(" ")
-    line = int(place.split(":")[0])
-    return f"{source.splitlines()[line - 1].strip() if line else 'module'}: {change}"
+    line, column = map(int, place.split(":"))
+    if change.startswith("statement"):  # by what it says, since its number moves, too
+        for node in ast.walk(ast.parse(source)):
+            here = getattr(node, "lineno", 0), getattr(node, "col_offset", 0)
+            if here == (line, column) and isinstance(getattr(node, "body", None), list):
+                return f"{ast.unparse(node.body[int(change.split()[1])])}: left out"
+    return f"{source.splitlines()[line - 1].strip()}: {change}"
 
 
 def passes(name: str, text: str) -> bool:

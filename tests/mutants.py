@@ -7,7 +7,6 @@ equivalent to the solution, and stands with its reason in `tests/data/equivalent
 import ast
 import copy
 import json
-import os
 import signal
 import sys
 import warnings
@@ -103,12 +102,8 @@ def survivors(number, seconds=10):
 
 def _imports(notebook):
     """What the solutions may use: the notebook's own imports and parameters."""
-    space, here = {}, os.getcwd()
-    os.chdir(ROOT / "notebooks")
-    try:
-        exec(imports_and_parameters(notebook), space)
-    finally:
-        os.chdir(here)
+    space = {}
+    exec("\n".join(imports_and_parameters(notebook)), space)
     return space
 
 

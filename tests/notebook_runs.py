@@ -18,7 +18,7 @@ from pathlib import Path
 import nbformat
 from nbclient.exceptions import CellExecutionError
 
-from lessons.restart import needs, sections
+from lessons.restart import heading, needs, sections
 from lessons.teaching import solution_copy
 from tests.notebook_tools import FOLDER, ROOT, notebooks, run
 
@@ -45,7 +45,8 @@ def parts(nb, options):
                 chosen = [i for piece in sorted({0, *needs(nb)[number], number}) for i in pieces[piece]]
                 part = copy.deepcopy(nb)
                 part.cells = [part.cells[i] for i in chosen]
-                yield nb.cells[cells[0]].source.rpartition("\n## ")[2].split("\n")[0].removeprefix("## "), part
+                title = heading(nb.cells[cells[0]])
+                yield title[0] if title else "the opening", part
     elif not options.twice:
         yield "all cells", nb
     else:

@@ -123,23 +123,23 @@ def function_name(notebook: Notebook, exercise: str) -> str:
     return ""
 
 
-def imports_and_parameters(notebook: Notebook) -> str:
-    """The code that a learner's function may need: every import of a notebook, and the cell of its parameters."""
-    lines = []
+def imports_and_parameters(notebook: Notebook) -> list[str]:
+    """Pieces of code that a learner's function may need: every import of a notebook, and the cell of its parameters."""
+    pieces = []
     for cell in notebook["cells"]:
         if cell["cell_type"] == "code" and "parameters" in tags(cell):
-            lines.append(cell["source"])
+            pieces.append(cell["source"])
         elif cell["cell_type"] == "code" and "exercise" not in tags(cell):
             with contextlib.suppress(SyntaxError):
                 body = ast.parse(cell["source"]).body
-                lines += [ast.unparse(node) for node in body if isinstance(node, ast.Import | ast.ImportFrom)]
-    return "\n".join(lines)
+                pieces += [ast.unparse(node) for node in body if isinstance(node, ast.Import | ast.ImportFrom)]
+    return pieces
 
 
 def _exercise_cells(notebook: Notebook, name: str) -> dict[str, object]:
     space: dict[str, object] = {}
     stubs = [cell["source"] for cell in notebook["cells"] if "exercise" in tags(cell)]
-    for source in [imports_and_parameters(notebook), *stubs]:
+    for source in [*imports_and_parameters(notebook), *stubs]:  # one that fails does not keep the others away
         with contextlib.suppress(Exception), contextlib.redirect_stdout(io.StringIO()):
             exec(compile(source, name, "exec"), space)
     return space

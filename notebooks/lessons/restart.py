@@ -20,7 +20,7 @@ _HEADING = re.compile(r"^## (?:(\d+)\. )?([^\n]*)", re.MULTILINE)
 
 def sections(nb: Notebook) -> list[range]:
     """Indices of the cells of each section, the opening first."""
-    heads = [i for i, cell in enumerate(nb["cells"]) if cell["cell_type"] == "markdown" and _title(cell)]
+    heads = [i for i, cell in enumerate(nb["cells"]) if cell["cell_type"] == "markdown" and heading(cell)]
     return [range(*pair) for pair in zip([0, *heads], [*heads, len(nb["cells"])], strict=True)]
 
 
@@ -44,14 +44,13 @@ def needed(pieces: list[str]) -> list[set[int]]:
     return found
 
 
-def line(nb: Notebook, number: int) -> str:
+def line(number: int, earlier: set[int], titles: list[re.Match[str] | None]) -> str:
     """The sentence of a section; empty where it needs nothing but the opening."""
-    others = sorted(needs(nb)[number] - {0})
+    others = sorted(earlier - {0})
     if len(others) == number - 1 > 1:
         return "*Needs everything above.*"
-    titles = [_title(nb["cells"][sections(nb)[other][0]]) for other in others]
-    numbers = [title[1] for title in titles if title[1]]
-    parts = [f"“{title[2]}”" for title in titles if not title[1]]
+    numbers = [titles[other][1] for other in others if titles[other][1]]
+    parts = [f"“{titles[other][2]}”" for other in others if not titles[other][1]]
     if numbers:
         parts.append(f"section{'s' if len(numbers) > 1 else ''} {_listed(numbers)}")
     return f"*Needs {_listed(parts)}.*" if parts else ""
@@ -59,13 +58,14 @@ def line(nb: Notebook, number: int) -> str:
 
 def with_lines(nb: Notebook) -> Notebook:
     """Write the sentences below the headings, in place of those that stand there; the opening gets the rule."""
-    for number, cells in enumerate(sections(nb)):
-        cell = nb["cells"][cells[0]]
+    heads = [nb["cells"][cells[0]] for cells in sections(nb)]
+    titles = [heading(cell) for cell in heads]
+    for number, (cell, others) in enumerate(zip(heads, needs(nb), strict=True)):
         cell["source"] = _LINE.sub("", cell["source"])
         if number == 0:
             cell["source"] += f"\n\n{RULE}"
-        elif sentence := line(nb, number):
-            end = _title(cell).end()
+        elif sentence := line(number, others, titles):
+            end = heading(cell).end()
             cell["source"] = f"{cell['source'][:end]}\n\n{sentence}{cell['source'][end:]}"
     return nb
 
@@ -84,7 +84,8 @@ def _names(code: CodeType) -> tuple[set[str], set[str]]:
     return used, made
 
 
-def _title(cell: Notebook) -> re.Match[str] | None:
+def heading(cell: Notebook) -> re.Match[str] | None:
+    """The last heading of a section in a text cell: number or None, title."""
     return max(_HEADING.finditer(cell["source"]), key=re.Match.start, default=None)  # the code below is the last one's
 
 

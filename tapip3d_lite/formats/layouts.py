@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tapip3d_lite.clip import Tracks
-from tapip3d_lite.files import load_objects, read_json
+from tapip3d_lite.files import load_objects, read_json, regular
 from tapip3d_lite.formats.arrays import require
 from tapip3d_lite.formats.folders import Parts, Settings, numbered, read_poses, rigid, table
 from tapip3d_lite.formats.images import DEPTHS, PICTURES, VIDEOS, read_depth
@@ -136,7 +136,7 @@ def movi(folder: Path) -> Parts:
 def kubric(folder: Path) -> Parts:
     """The authors' training clips: `frames/000.png`, `frames/000_depth.png`, and NAME/NAME.npy with cameras and tracks."""
     path = folder / f"{folder.resolve().name}.npy"
-    with open(path, "rb") as file:
+    with open(regular(path), "rb") as file:
         truth = load_objects(path, file)
     keys = ("depth_range", "traj_3d", "occluded", "intrinsics", "matrix_world")
     require(path, truth, "a training clip", keys, "take the complete file")

@@ -18,7 +18,7 @@ import safetensors.torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from tapip3d_lite.files import atomic_path
+from tapip3d_lite.files import atomic_path, regular
 from tapip3d_lite.model.config import TrackerConfig
 from tapip3d_lite.model.tracker import Tracker
 from tapip3d_lite.outline import NoValues
@@ -71,8 +71,7 @@ def load_weights(
 
 def read_weights(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Parameters and config as they stand in a file of `save_weights`, else ValueError; nothing is imported."""
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: no such file; check the path")
+    regular(path)
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}

@@ -53,8 +53,8 @@ def simulate_dataset(
         ValueError: bad number, or the folder holds clips of another configuration, or another process writes to it.
         BrokenProcessPool: as for `run_jobs`; the same call goes on.
     """
-    workers_ = 1 if workers is None else workers
-    for name, value, low in (("count", count, 1), ("first_seed", first_seed, 0), ("workers", workers_, 1)):
+    processes = 1 if workers is None else workers
+    for name, value, low in (("count", count, 1), ("first_seed", first_seed, 0), ("workers", processes, 1)):
         if not isinstance(value, int) or not low <= value <= 10**9:
             raise ValueError(
                 f"simulate_dataset: {name} must be a whole number of at least {low}, at most 1e9, got {value!r}"
