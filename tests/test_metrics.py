@@ -189,6 +189,8 @@ def test_lists_and_whole_numbers_are_scored_as_floats():
     for form in (np.asarray, lambda x: x.tolist()):
         arguments = (form(x) for x in (p, seen, q, seen, k))
         assert t3d.tapvid3d_metrics(*arguments, scaling="none") == expected
+    flat = t3d.tapvid2d_metrics(p[..., :2], seen, q[..., :2], seen, np.zeros(1))
+    assert flat["within_16"] == 0  # the frame of 20 pixels
 
 
 @pytest.mark.parametrize(
